@@ -14,6 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from obbgs_core.errors import expect
+
 FEWEST_PX = 1_000_000  # smaller pictures stay as they are: reading them often would cost more than they take
 
 
@@ -180,6 +182,8 @@ class HeldCompact:
         return self if instance is None else whole(instance.__dict__[self._name])
 
     def __set__(self, instance, value) -> None:
+        if not isinstance(value, Compact):
+            expect(value, Tensor, self._name[1:], "a torch.Tensor")
         instance.__dict__[self._name] = held(value)
 
 

@@ -1,10 +1,24 @@
 """The errors of a reconstruction."""
 
 from obbgs_base.errors import ObbgsError
+from obbgs_base.values import told
 
 
 class ReconstructionError(ObbgsError):
     """The frames do not allow a model."""
+
+
+def expect(value: object, wanted: type, name: str, expected: str) -> None:
+    """Refuse what is not of a type.
+
+    Raises:
+        ValueError: names what is wrong, what was expected and what came.
+    """
+    if isinstance(value, wanted):
+        return
+    simple = value is None or isinstance(value, (str, int, float))
+    came = told(value) if simple else f"{type(value).__module__}.{type(value).__qualname__}"
+    raise ValueError(f"{name}: expected {expected}, got {came}")
 
 
 class TooFewFrames(ReconstructionError):

@@ -2,9 +2,9 @@
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import cast
+from typing import SupportsFloat, cast
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from torch import Tensor
 from obbgs_base.physics.navigation_errors import SharedParameters
 from obbgs_core.compact import Compact, changed, hold_compact, part, seen
 from obbgs_core.compiled import each
-from obbgs_core.errors import ReconstructionError, TooFewFrames
+from obbgs_core.errors import ReconstructionError, TooFewFrames, expect
 from obbgs_core.model.cameras import Cameras, stacked_suns
 from obbgs_core.model.motions import point_flow
 from obbgs_core.model.pose_covariance import flaw
@@ -24,6 +24,7 @@ FEWEST_FRAMES = 3
 ROTATION_TOLERANCE = 1e-3  # of R Rᵀ from 1, single precision and printed numbers included
 K_TOLERANCE_PX = 1e-3
 READING_TOLERANCE = 1e-6
+TENSORS = ("world_to_camera", "K", "pose_covariance", "sun_dir", "inertial_to_body", "earth_m", "rates")
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,6 +211,24 @@ def alike(frames: list[TrainingFrame]) -> list[TrainingFrame]:
         else f
         for f in frames
     ]
+
+
+def given(frames: Iterable[TrainingFrame]) -> list[TrainingFrame]:
+    """Return the frames as a list, the types of what is in them checked; `usable` checks the values.
+
+    Raises:
+        ValueError: something is no frame, or what a frame holds is no tensor where `TrainingFrame` wants one.
+    """
+    expect(frames, Iterable, "frames", "a list of TrainingFrame")
+    frames = list(frames)
+    for position, frame in enumerate(frames):
+        expect(frame, TrainingFrame, f"frames[{position}]", "a TrainingFrame")
+        expect(frame.exposure_time_s, SupportsFloat, f"frame {frame.id}: exposure_time_s", "seconds")
+        for name in TENSORS:
+            value = getattr(frame, name)
+            if value is not None or name in ("world_to_camera", "K"):
+                expect(value, Tensor, f"frame {frame.id}: {name}", "a torch.Tensor")
+    return frames
 
 
 def usable(

@@ -35,7 +35,7 @@ FIGURES = (  # of metrics.json, in the order of a comparison
         "pose_error_range",
         "size_error_percent",
     ),
-    *("train_seconds", "train_steps", "frames_trained", "frames_held_out"),
+    *("train_seconds", "schedule_steps", "train_steps", "frames_trained", "frames_held_out"),
 )
 LOST_ON_BOARD = {
     "frames_failed": "exposures failed",

@@ -5,7 +5,7 @@ import logging
 import math
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from itertools import pairwise
 from pathlib import Path
 
@@ -15,9 +15,9 @@ from obbgs_base.errors import Interrupted, reason
 from obbgs_core.background import backdrop
 from obbgs_core.batches import Batch, Batches
 from obbgs_core.compiled import torch_on_one_thread
-from obbgs_core.errors import Diverged
+from obbgs_core.errors import Diverged, expect
 from obbgs_core.evidence.radiance import described
-from obbgs_core.frames import TrainingFrame, alike
+from obbgs_core.frames import TrainingFrame, alike, given
 from obbgs_core.methods.config import SET_BACK_AT, SET_BACK_TO, MethodConfig, Moment
 from obbgs_core.model.gaussians import Gaussians
 from obbgs_core.poses.corrections import PoseCorrections
@@ -45,7 +45,7 @@ DECISIONS = 0.4
 
 
 def train(
-    frames: list[TrainingFrame],
+    frames: Iterable[TrainingFrame],
     sensor: Sensor,
     config: MethodConfig,
     seed: int = 0,
@@ -67,6 +67,7 @@ def train(
         on_warning: called with each thing that is unusual about the frames.
 
     Raises:
+        ValueError: frames, sensor or config are of another type.
         TooFewFrames: fewer than three frames.
         ReconstructionError: every frame is black, or frames differ in size.
         Diverged: the loss, or all of the Gaussians, stopped being finite.
@@ -112,12 +113,15 @@ class Trainer:
     @torch_on_one_thread()
     def __init__(
         self,
-        frames: list[TrainingFrame],
+        frames: Iterable[TrainingFrame],
         sensor: Sensor,
         config: MethodConfig,
         seed: int = 0,
         on_warning: Callable[[str], None] = log.warning,
     ):
+        expect(sensor, Sensor, "sensor", "a Sensor")
+        expect(config, MethodConfig, "config", 'a MethodConfig, such as preset("obbgs")')
+        frames = given(frames)
         began, self._backend = time.monotonic(), backend_for(config.device)
         self._given, self._stated = frames, sensor
         self.setup, start = prepare(frames, sensor, config, seed)
@@ -294,7 +298,9 @@ class Trainer:
         if config.chi2_end and state.fit.chi2 <= config.chi2_end and self.is_past_growth and all_drawn:
             return f"residual chi² reached the noise ({state.fit.chi2:.3f})"
         if state.steps_done >= config.steps:
-            return f"all {config.steps} steps done (residual chi² {state.fit.chi2:.2f})"
+            taken = len(state.history)  # more where the schedule was set back, for poses or for growth
+            again = "" if taken == config.steps else f" of the schedule done, {taken:,} in all"
+            return f"all {config.steps} steps{again or ' done'} (residual chi² {state.fit.chi2:.2f})"
         return ""
 
     @torch_on_one_thread()

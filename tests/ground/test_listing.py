@@ -155,6 +155,7 @@ def test_a_run_shows_its_quality_what_was_decided_of_poses_and_their_errors_but_
     found = json.loads(called("compare-runs", str(runs / "first"), str(runs / "second"), "--json"))
     assert found["figures"]["quality"] == ["8 steps", "draft"]
     assert found["figures"]["pose_error_px"] == [None, 0.31]
+    assert found["figures"]["schedule_steps"] == [8, steps]
     assert list(found["settings"]) == ["session.frames"]
 
 

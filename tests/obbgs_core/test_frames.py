@@ -11,6 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.frames import TrainingFrame, bracket_numbers, usable
+from obbgs_core.methods.presets import preset
+from obbgs_core.train import train
+from tests.scenes import SENSOR
 
 WHITE_DN = 4095
 
@@ -20,6 +23,41 @@ def frame(**changes) -> TrainingFrame:
     pose[2, 3] = 4.0
     K = torch.tensor([[60.0, 0, 16], [0, 60, 16], [0, 0, 1]])
     return dataclasses.replace(TrainingFrame(torch.zeros(8, 8, 1), 0.01, pose, K), **changes)
+
+
+def test_a_picture_that_is_no_tensor_is_refused():
+    with pytest.raises(ValueError, match=r"^dn: expected a torch\.Tensor, got numpy\.ndarray$"):
+        frame(dn=np.zeros((8, 8, 1)))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ({"frames": 3}, "frames: expected a list of TrainingFrame, got 3"),
+        ({"frames": ["a.png"]}, "frames[0]: expected a TrainingFrame, got 'a.png'"),
+        (
+            {"frames": [frame(world_to_camera=np.eye(4))]},
+            "frame 0: world_to_camera: expected a torch.Tensor, got numpy.ndarray",
+        ),
+        (
+            {"frames": [frame(sun_dir=np.ones(3))]},
+            "frame 0: sun_dir: expected a torch.Tensor, got numpy.ndarray",
+        ),
+        ({"frames": [frame(exposure_time_s="1")]}, "frame 0: exposure_time_s: expected seconds, got '1'"),
+        ({"sensor": None}, "sensor: expected a Sensor, got nothing"),
+        ({"config": "obbgs"}, "config: expected a MethodConfig, such as preset(\"obbgs\"), got 'obbgs'"),
+    ],
+)
+def test_what_a_training_is_given_of_another_type_is_refused_in_one_line(wrong, told):
+    arguments = {"frames": [frame()] * 3, "sensor": SENSOR, "config": preset("obbgs")} | wrong
+    with pytest.raises(ValueError) as refused:
+        train(**arguments)
+    assert str(refused.value) == told
+
+
+def test_a_training_takes_frames_one_by_one():
+    with pytest.raises(ReconstructionError, match="needs at least 3 frames, got 2"):
+        train((frame() for _ in range(2)), SENSOR, preset("obbgs"))
 
 
 def checked(bad: TrainingFrame) -> list[TrainingFrame]:

@@ -27,6 +27,8 @@ def test_models_do_not_depend_on_how_long_pictures_take_to_say_what_they_know_of
 ):
     use_threads(1)  # each round is answered before the step goes on
     whole = train(doubted, SENSOR, CONFIG, seed=3)
+    told = f"all 40 steps of the schedule done, {len(whole.history)} in all (residual"
+    assert len(whole.history) > 40 and whole.stop_reason.startswith(told)
     use_threads(3)
     may_answer, answer, answered = threading.Event(), Question.answer, []
 
