@@ -21,7 +21,7 @@ from compare.opponents.sfm import Pictures, reconstruct_sfm
 from compare.trainings import reconstruct_gaussians
 from obbgs_core.frames import TrainingFrame
 from obbgs_core.methods.config import MethodConfig
-from obbgs_core.methods.presets import budget_changes, preset
+from obbgs_core.methods.presets import PRESETS, budget_changes, preset
 from obbgs_core.sensor import Sensor
 from obbgs_core.settings import changed, flat
 
@@ -105,6 +105,8 @@ def method(name: str, weights: Path | None = None) -> Method:
     try:
         return _training(preset(plain), name, validated=name != plain)
     except ValueError as error:
+        if plain.partition("+")[0] in PRESETS:
+            raise
         others = ", ".join([*reference_names(), *_BASELINES, MVSNET])
         raise ValueError(f"{error}; or {others}, which are no trainings of Gaussians") from error
 

@@ -132,9 +132,9 @@ def cells_of(
     for facts in sessions:
         for key in (facts.name, facts.digest):
             if key in known:
+                same, way_out = ("content", "") if key == facts.digest else ("name", ", or rename its folder")
                 raise CompareError(
-                    f"{known[key]} and {facts.path} have the same {'name' if key == facts.name else 'content'}: "
-                    "leave one out, or rename its folder"
+                    f"{known[key]} and {facts.path} have the same {same}: leave one out{way_out}"
                 )
             known[key] = facts.path
     registered = [method(name, weights) for name in dict.fromkeys(methods)]

@@ -371,7 +371,8 @@ def read_header(folder: Path) -> dict[str, Any]:
     try:
         header = _header(path)
     except (FileNotFoundError, NotADirectoryError) as error:
-        raise SessionError(f"{folder} is not a session: it has no session.json") from error
+        inside = next((f"; {path.parent} is one" for path in sorted(folder.glob("*/session.json"))), "")
+        raise SessionError(f"{folder} is not a session: it has no session.json{inside}") from error
     except OSError as error:
         raise SessionError(f"{path} cannot be read: {reason(error)}") from error
     except ConfigError as error:

@@ -142,11 +142,14 @@ def test_unknown_methods_are_refused_with_the_known_ones():
         method("nerg")
     with pytest.raises(ValueError, match="no variant 'exposed'"):
         method("3dgs+exposed")
+    with pytest.raises(ValueError, match="'exposure' changes nothing in 'obbgs'") as refused:
+        method("obbgs+exposure+exposure")
+    assert "black" not in str(refused.value)
 
 
 def test_two_sessions_of_one_content_are_refused(session, tmp_path):
     shutil.copytree(session, tmp_path / "copy")
-    with pytest.raises(CompareError, match="have the same content"):
+    with pytest.raises(CompareError, match=r"have the same content: leave one out$"):
         cells_of([session_facts(session), session_facts(tmp_path / "copy")], ["black"], 1, [Budget()], PLAIN)
 
 

@@ -171,6 +171,10 @@ def test_a_table_gives_what_the_pictures_do_not_say(tmp_path):
     assert seconds[1] / seconds[0] == pytest.approx(8)
     with pytest.raises(FormatError, match=r"lacks 1 picture: c\.jpg"):
         with_exposures([*views, plain(tmp_path / "c.jpg")], read_table(tmp_path / "t.csv"))
+    with pytest.raises(
+        FormatError, match=r"none of the 1 pictures: it has a\.jpg, .* first picture is c\.jpg"
+    ):
+        with_exposures([plain(tmp_path / "c.jpg")], read_table(tmp_path / "t.csv"))
 
 
 @pytest.mark.parametrize(
@@ -179,6 +183,7 @@ def test_a_table_gives_what_the_pictures_do_not_say(tmp_path):
         ("", "first line with name"),
         ("name\na.jpg\n", "first line with name"),
         ("name,time\na.jpg,1\n", "first line with name"),
+        ("name,iso,comment\na.jpg,1,dark\n", "got 'name,iso,comment'; there is no column 'comment'"),
         ("name,iso,iso\na.jpg,1,1\n", "first line with name"),
         ("name,iso\na.jpg\n", "line 2: expected 2 values, got 1"),
         ("name,iso\na.jpg,1\nx/a.jpg,1\n", "line 3: a.jpg is listed twice"),

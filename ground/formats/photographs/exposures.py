@@ -58,14 +58,11 @@ def read_table(path: Path) -> dict[str, Light]:
     except (OSError, csv.Error) as error:
         raise FormatError(f"{path}: the table cannot be read: {reason(error)}") from error
     names = [name.strip() for name in rows[0]] if rows else []
-    if (
-        "name" not in names
-        or len(names) < 2
-        or not set(names) <= set(COLUMNS)
-        or len(set(names)) < len(names)
-    ):
+    unknown = next((f"; there is no column {name!r}" for name in names if name not in COLUMNS), "")
+    if "name" not in names or len(names) < 2 or unknown or len(set(names)) < len(names):
         raise FormatError(
-            f"{path}: expected a first line with name and some of {', '.join(COLUMNS[1:])}, got {','.join(names)!r}"
+            f"{path}: expected a first line with name and some of {', '.join(COLUMNS[1:])}, got "
+            f"{','.join(names)!r}{unknown}"
         )
     table: dict[str, Light] = {}
     for number, row in enumerate(rows[1:], start=2):
@@ -100,7 +97,13 @@ def with_exposures(views: Sequence[View], table: dict[str, Light] | None = None)
             counted(turned, "picture"),
         )
     if table is not None:
-        if missing := [view.image.name for view in views if view.image.name not in table]:
+        missing = [view.image.name for view in views if view.image.name not in table]
+        if missing and len(missing) == len(views):
+            named = (
+                f"none of the {len(views)} pictures: it has {next(iter(table))}" if table else "no picture"
+            )
+            raise FormatError(f"the table of exposures names {named}, and the first picture is {missing[0]}")
+        if missing:
             raise FormatError(
                 f"the table of exposures lacks {counted(len(missing), 'picture')}: {', '.join(missing[:5])}"
             )
