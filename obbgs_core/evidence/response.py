@@ -2,8 +2,9 @@
 
 The model is one for all exposure times. If the readings of long exposures are too bright for it and those of short
 ones too dark, by a ratio that is a power of the exposure time, then readings are that power of light. Compared are
-neighbours in a bracket, or, where every view has one exposure, the frames of neighbouring settings in each tenth of the
-pass, which see the target from all of its sides alike. An exposure time that an automatic camera chose by what it saw
+neighbours in a bracket, or, where every view has one exposure, frames of neighbouring settings that see the target from
+nearly the same direction: from another, glare differs by more than what is looked for. Of what they say the median
+counts. An exposure time that an automatic camera chose by what it saw
 says what it saw, and tells nothing. Readings count in the radiance that both can read, so that a model which is too
 dark where it is bright is no evidence either.
 
@@ -42,9 +43,10 @@ FRAMES_FROM = 0.5
 FOLLOWED_AT = (0.6, 0.8, 0.9)  # and where they are used
 LEAST_STEP = 0.1  # of the logarithms of exposure times that are compared
 FEWEST_READINGS = 30
-MOST = 60  # frames, or pairs of neighbours in a bracket, that are rendered
+MOST = 60  # pairs of neighbours in a bracket that are rendered
 FEWEST = 24  # pairs of neighbours in brackets; of each setting, where views have one exposure, one a part
-LEFT_OUT = 10  # parts of the pass, each left out once (jackknife)
+LEFT_OUT = 10  # parts of the pass or, where views have one exposure, of all directions, each left out once (jackknife)
+MOST_OF_PART = 5  # pairs of nearly the same direction
 FEWEST_PARTS = 7  # that tell something
 # of ln of exposure times and ln of the light that the model shows in the frames: more, and the camera chose them by it
 MOST_CHOSEN = 0.5
@@ -102,7 +104,7 @@ class Response:
             return True
         in_brackets = _in_brackets(batches.frames)
         pairs = in_brackets or _in_turns(batches.frames)
-        indices = sorted({i for pair in pairs for i in (*pair.one, *pair.other)})
+        indices = sorted({i for pair in pairs for i in (pair.one, pair.other)})
         frames = batches.frames
         found = each(lambda i: _told(model, batches.batch([i]), sensor, frames[i].exposure_time_s), indices)
         told = dict(zip(indices, found, strict=True))
@@ -201,9 +203,9 @@ class _Contrasts:
         return _Contrasts(times_s, design, np.array([f[3] for f in found]), np.array([f[0] for f in found]))
 
     def slope(self, kept: np.ndarray) -> np.ndarray:
-        """Return the slope over ln of exposure times that fits some contrasts best."""
+        """Return the median of the slopes over ln of exposure times of some contrasts."""
         steps = (self.design @ np.log(self.times_s))[kept]
-        return np.array(steps @ self.values[kept] / (steps @ steps))
+        return np.array(np.median(self.values[kept] / steps))
 
     def settings(self, kept: np.ndarray) -> np.ndarray:
         """Return one value for each exposure time [S] that fits some contrasts best, with a median of 0."""
@@ -218,11 +220,11 @@ class _Contrasts:
 
 
 class _Pair(NamedTuple):
-    """Frames of one exposure time that are compared with those of another, by index, and in which part of the pass."""
+    """A frame of one exposure time that is compared with one of another, by index, and in which part they are."""
 
     part: int
-    one: list[int]
-    other: list[int]
+    one: int
+    other: int
 
 
 def _explained(frames: list[TrainingFrame]) -> float:
@@ -246,20 +248,34 @@ def _in_brackets(frames: list[TrainingFrame]) -> list[_Pair]:
     if len(pairs) < FEWEST:
         return []
     chosen = np.linspace(0, len(pairs) - 1, min(len(pairs), MOST)).round().astype(int)
-    return [_Pair(n * LEFT_OUT // len(chosen), [pairs[k]], [pairs[k] + 1]) for n, k in enumerate(chosen)]
+    return [_Pair(n * LEFT_OUT // len(chosen), pairs[k], pairs[k] + 1) for n, k in enumerate(chosen)]
 
 
 def _in_turns(frames: list[TrainingFrame]) -> list[_Pair]:
-    """Return what neighbouring settings saw in each part of the pass, of exposure times that come again and again."""
-    chosen = np.linspace(0, len(frames) - 1, min(len(frames), MOST)).round().astype(int).tolist()
-    parts = np.array_split(chosen, LEFT_OUT)
-    times_s, counts = np.unique([frames[i].exposure_time_s for i in chosen], return_counts=True)
+    """Return frames of neighbouring settings in pairs that see the target from nearly the same direction."""
+    exposures_s = np.array([frame.exposure_time_s for frame in frames])
+    times_s, counts = np.unique(exposures_s, return_counts=True)
     settings = times_s[(2 * counts > counts.max()) & (counts >= LEFT_OUT)]
+    along = torch.nn.functional.normalize(cameras_of(frames).centres.double(), dim=1).numpy()
+    cosines = along @ along.T
+    middles = [0]  # of parts: each is as far from those before it as any frame
+    while len(middles) < LEFT_OUT:
+        middles.append(int(cosines[:, middles].max(axis=1).argmin()))
+    part = cosines[:, middles].argmax(axis=1)
+    candidates = [
+        (-cosines[i, j], i, j)
+        for one_s, other_s in itertools.pairwise(settings)
+        if math.log(other_s / one_s) > LEAST_STEP
+        for i in np.flatnonzero(exposures_s == one_s)
+        for j in np.flatnonzero(exposures_s == other_s)
+    ]
+    uses, of_part = np.zeros(len(frames), dtype=int), np.zeros(LEFT_OUT, dtype=int)
     pairs = []
-    for (number, part), (one_s, other_s) in itertools.product(enumerate(parts), itertools.pairwise(settings)):
-        one, other = ([i for i in part.tolist() if frames[i].exposure_time_s == s] for s in (one_s, other_s))
-        if one and other and math.log(other_s / one_s) > LEAST_STEP:
-            pairs.append(_Pair(number, one, other))
+    for _, i, j in sorted(candidates):
+        if max(uses[i], uses[j]) < 2 and of_part[part[i]] < MOST_OF_PART:
+            uses[[i, j]] += 1
+            of_part[part[i]] += 1
+            pairs.append(_Pair(int(part[i]), int(i), int(j)))
     return pairs
 
 
@@ -315,7 +331,7 @@ def _compared(pair: _Pair, told: dict[int, _Told]) -> tuple[int, float, float, f
 
     None where too few readings of either lie in the radiance that both can read.
     """
-    one, other = (_together([told[i] for i in indices]) for indices in (pair.one, pair.other))
+    one, other = told[pair.one], told[pair.other]
     if not one.radiance.numel() or not other.radiance.numel():
         return None
     least = max(float(one.radiance.min()), float(other.radiance.min()))
