@@ -88,6 +88,7 @@ def import_command(
 
     Example: ground import --format shirt --from shirtv1/roe1/lightbox --frames 363 --session roe1
     """
+    from ground.formats.photographs.brackets import in_brackets_of_places
     from ground.formats.photographs.exposures import UNKNOWN, estimated, read_table, with_exposures
     from ground.formats.pictures.placement import placed, with_stated_errors
     from ground.formats.pictures.views import EXACT, Values, first_of_each_split, write_session
@@ -106,7 +107,7 @@ def import_command(
         views, exported = _read(format_, folder, table, session)
         views = first_of_each_split(views, frames)
         if exposures != UNKNOWN and format_ not in TIMED:
-            views = with_exposures(views, table)
+            views = in_brackets_of_places(with_exposures(views, table))
     views, found_poses, source = _masked(views, masks, session), {}, f"{format_.value}: {folder}"
     given = None if values is None else Values(values.value)
     if exposures == UNKNOWN:

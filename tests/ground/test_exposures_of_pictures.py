@@ -21,7 +21,7 @@ from flightsw.icd.ndm.formation import Formation
 from flightsw.icd.ndm.write import Object, write_aem, write_oem
 from flightsw.icd.quaternion import matrix_to_quat
 from ground.formats.axes import world_to_camera_to_opengl
-from ground.formats.photographs.brackets import brackets_of
+from ground.formats.photographs.brackets import brackets_of, in_brackets_of_places
 from ground.formats.photographs.exposures import estimated, light_s, read_table, with_exposures
 from ground.formats.photographs.poses import read_photographs
 from ground.formats.pictures.files import FormatError, Light, decode, read_header
@@ -270,6 +270,29 @@ def test_exposures_that_come_again_in_the_same_order_are_brackets():
     assert numbers(paused) == [i // 2 for i in range(10)]
     members = brackets_of(shots(list(BRACKET_S) * 3))[1]
     assert [(v.bracket, v.bracket_index) for v in members] == [(1, 0), (1, 1), (1, 2)]
+
+
+def posed(places: list[int], shift_m: float = 0.0) -> list[View]:
+    """Return views of exposures that come again in the same order, from places on a circle, each moved a little."""
+    views = shots(list(BRACKET_S) * (len(places) // 3))
+    moved = []
+    for number, (view, place) in enumerate(zip(views, places, strict=True)):
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_euler("y", 20.0 * place, degrees=True).as_matrix()
+        pose[:3, 3] = [shift_m * (number % 3), 0.0, 5.0]
+        moved.append(dataclasses.replace(view, world_to_camera=pose))
+    return moved
+
+
+def test_pictures_with_known_cameras_are_brackets_where_each_was_taken_from_one_place():
+    brackets = in_brackets_of_places(posed([i // 3 for i in range(18)], shift_m=0.005))
+    assert [view.bracket for view in brackets] == [i // 3 for i in range(18)]
+    assert all(view.bracket is None for view in in_brackets_of_places(posed(list(range(18)))))
+    assert all(
+        view.bracket is None for view in in_brackets_of_places(posed([i // 3 for i in range(18)], 0.1))
+    )
+    stated = [dataclasses.replace(view, split="train") for view in posed([i // 3 for i in range(18)])]
+    assert all(view.bracket is None for view in in_brackets_of_places(stated))
 
 
 @settings(max_examples=50)

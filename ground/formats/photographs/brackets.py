@@ -7,6 +7,7 @@ from pathlib import Path
 
 import imagecodecs
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ground.formats.pictures.view import View, colours_of, grey_light, has_display_values, read_image
 from ground.formats.pictures.views import EQUAL_EXPOSURES
@@ -15,6 +16,8 @@ from obbgs_base.srgb import to_srgb
 
 LONGEST_BREAK_S = 5.0  # between the frames of a bracket, where times are known
 WHOLE = 0.8  # share of the brackets that must have every exposure
+# radians between views of one place, and the same of their distance as a share of how far all views are apart
+SAME_PLACE = 0.003
 CLIPPED = 0.98  # of full scale: brighter pixels may be saturated
 BRIGHT, SHOWN_AS = (
     0.995,
@@ -55,6 +58,33 @@ def brackets_of(views: Sequence[View]) -> list[list[View]]:
         [dataclasses.replace(view, bracket=number, bracket_index=index) for index, view in enumerate(group)]
         for number, group in enumerate(groups)
     ]
+
+
+def in_brackets_of_places(views: Sequence[View]) -> list[View]:
+    """Return pictures with known cameras with their brackets, where each bracket was taken from one place.
+
+    As they are where they state brackets or splits, or where exposures of a pattern come from different places.
+    """
+    if any(view.bracket is not None or view.split is not None for view in views):
+        return list(views)
+    brackets = brackets_of(views)
+    centres = np.stack([np.linalg.inv(view.world_to_camera)[:3, 3] for view in views])
+    nearest = SAME_PLACE * float(np.ptp(centres, axis=0).max())
+    if all(_of_one_place(bracket, nearest) for bracket in brackets):
+        return [view for bracket in brackets for view in bracket]
+    return list(views)
+
+
+def _of_one_place(bracket: Sequence[View], nearest: float) -> bool:
+    """Return whether the cameras of a bracket lie as near to its first and are turned as little as SAME_PLACE asks."""
+    first = bracket[0].world_to_camera
+    for view in bracket[1:]:
+        turn = first[:3, :3] @ view.world_to_camera[:3, :3].T
+        angle = np.linalg.norm(Rotation.from_matrix(turn).as_rotvec())
+        away = np.linalg.norm(np.linalg.inv(view.world_to_camera)[:3, 3] - np.linalg.inv(first)[:3, 3])
+        if angle > SAME_PLACE or away > nearest:
+            return False
+    return True
 
 
 def write_for_features(folder: Path, brackets: Sequence[Sequence[View]]) -> None:
