@@ -34,7 +34,7 @@ MODELS = {
 }
 PARAMETERS = dict(MODELS.values())
 SUFFIXES = (".bin", ".txt")
-ROUNDED = 1e-6  # a pose of ours that went through a model's quaternion differs by less, m
+ROUNDED = 1e-6  # a pose of ours that went through a model's quaternion differs by less, of its distance or in radians
 
 
 def read_colmap(folder: Path) -> list[View]:
@@ -107,7 +107,9 @@ def _completed(view: View, told: View | None) -> View:
         quat_inertial_to_body=None if attitude is None else attitude_behind(attitude, was, now),
         sun_dir_body=now[:3, :3].T @ was[:3, :3] @ told.sun_dir_body,
     )
-    if np.allclose(now, was, rtol=0, atol=ROUNDED):
+    apart = np.abs(now - was)
+    apart[:, 3] /= max(1.0, float(np.linalg.norm(was[:3, 3])))
+    if (apart < ROUNDED).all():
         return completed
     return with_stated_errors([dataclasses.replace(completed, covariance=None)])[0]
 

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 import shutil
+from collections import Counter
 from pathlib import Path
 
 import cv2
@@ -263,6 +264,15 @@ def test_a_colmap_export_comes_back_with_its_exposures_and_readings_and_the_came
         if before is not moved:
             np.testing.assert_allclose(after.covariance, before.covariance)
     assert again.frames[0].covariance.any()  # of the moved one nobody states it: about a pixel
+
+
+def test_exact_poses_stay_exact_through_a_colmap_model_and_its_counts_are_those_of_the_import(tmp_path):
+    shipped = open_session(Path(__file__).parents[2] / "examples" / "small_session")
+    counts = export_colmap(shipped, tmp_path / "c")
+    views, exported = read_colmap_and_export(tmp_path / "c")
+    write_session(views, tmp_path / "again", "colmap", exported=exported)
+    assert not any(record.covariance.any() for record in open_session(tmp_path / "again").frames)
+    assert counts == Counter(view.split for view in views)
 
 
 def test_the_points_of_a_colmap_export_lie_on_the_surface_and_colmap_reads_them(tmp_path, session):
