@@ -136,10 +136,8 @@ def import_command(
             transparent_on_white=format_ is ImportFormat.NERF,
         )
     shutil.rmtree(session / VIDEO_FRAMES, ignore_errors=True)
-    if json_:
-        print(json.dumps({"frames": count, "session": str(session), **(registration or {}), **found_poses}))
-    else:
-        _tell(count, session, registration or {})
+    told = {"frames": count, "session": str(session), **(registration or {}), **found_poses}
+    print(json.dumps(told) if json_ else _told(count, session, registration or {}))
 
 
 def _check_there(format_: ImportFormat, folder: Path, masks: Path | None) -> None:
@@ -156,13 +154,14 @@ def _check_there(format_: ImportFormat, folder: Path, masks: Path | None) -> Non
         raise ConfigError("--masks", f"expected a folder that is there, got {masks}")
 
 
-def _tell(count: int, session: Path, registration: dict) -> None:
-    """Print how many pictures there are, and which photographs structure from motion left out or turned."""
-    print(f"{counted(count, 'picture')} in {session}")
+def _told(count: int, session: Path, registration: dict) -> str:
+    """Return how many pictures there are, and which photographs structure from motion left out or turned."""
+    lines = [f"{counted(count, 'picture')} in {session}"]
     if registration.get("left_out"):
-        print(f"left out, because they could not be registered: {', '.join(registration['left_out'])}")
+        lines.append(f"left out, because they could not be registered: {', '.join(registration['left_out'])}")
     if registration.get("turned"):
-        print(f"turned by 180 degrees against the others: {', '.join(registration['turned'])}")
+        lines.append(f"turned by 180 degrees against the others: {', '.join(registration['turned'])}")
+    return "\n".join(lines)
 
 
 def _read(
