@@ -29,6 +29,7 @@ from ground.session.folder import (
     open_session,
     read_frame_lines,
     read_records,
+    session_inside,
 )
 from ground.session.training_frames import split, told_before, training_frame
 from obbgs_base.errors import reason
@@ -150,8 +151,11 @@ def session_of(path: Path) -> Path:
     if (run / "model.ply").is_file():
         raise SessionError(f"{path} does not lie in runs/ of a session, whose frames and camera are needed")
     raise SessionError(
-        f"{path} is neither a session (session.json) nor a run in runs/ of one; a session begins with `ground listen`, "
-        "`ground live` or `ground import`"
+        f"{path} is neither a session (session.json) nor a run in runs/ of one"
+        + (
+            session_inside(path)
+            or "; a session begins with `ground listen`, `ground live` or `ground import`"
+        )
     )
 
 

@@ -360,6 +360,11 @@ def open_session(folder: str | Path) -> Session:
     return Session(folder, camera, frames, losses, *facts)
 
 
+def session_inside(folder: Path) -> str:
+    """Return for a message which folder directly in this one is a session; nothing where none is."""
+    return next((f"; {path.parent} is one" for path in sorted(folder.glob("*/session.json"))), "")
+
+
 def read_header(folder: Path) -> dict[str, Any]:
     """Return session.json, its schema version checked; where it is damaged, what its copy holds.
 
@@ -371,8 +376,9 @@ def read_header(folder: Path) -> dict[str, Any]:
     try:
         header = _header(path)
     except (FileNotFoundError, NotADirectoryError) as error:
-        inside = next((f"; {path.parent} is one" for path in sorted(folder.glob("*/session.json"))), "")
-        raise SessionError(f"{folder} is not a session: it has no session.json{inside}") from error
+        raise SessionError(
+            f"{folder} is not a session: it has no session.json{session_inside(folder)}"
+        ) from error
     except OSError as error:
         raise SessionError(f"{path} cannot be read: {reason(error)}") from error
     except ConfigError as error:

@@ -86,6 +86,10 @@ def test_what_is_no_run_is_told_so(session, tmp_path):
     shutil.copytree(session / "runs" / "run", tmp_path / "alone")
     with pytest.raises(SessionError, match=r"does not lie in runs/ of a session"):
         Source(tmp_path / "alone")
+    (tmp_path / "sat").mkdir()
+    (tmp_path / "sat" / "session").symlink_to(session.resolve())
+    with pytest.raises(SessionError, match=r"sat is neither a session .* of one; .*sat/session is one$"):
+        Source(tmp_path / "sat")
 
 
 def test_a_run_that_is_yet_to_come_is_waited_for(session, tmp_path):
