@@ -114,6 +114,47 @@ def test_a_replay_goes_at_its_speed_shows_no_future_and_tells_the_time(session, 
     assert len(plot.series) == len(plot.data) == lines + 1
 
 
+def test_a_replay_that_is_ended_while_it_goes_on_leaves_the_whole_pass_and_begins_anew(session, server):
+    """The box is unticked by another thread than the one that draws, here between the two parts of one step."""
+    plots = PassPlots(server, session, lambda _: untick())
+
+    def untick():
+        if plots.controls is not None:
+            plots.controls.replay.value = False
+
+    plots.tick(0.25)
+    controls = plots.controls
+    assert controls is not None
+    controls.replay.value = True
+    plots.tick(0.25)
+    plots.tick(0.25)
+    assert len(controls.plots["outbox_frames"].data[0]) == 21 and "at 65" in controls.told.content
+    controls.place.value, controls.replay.value = controls.place.max, True
+    plots.tick(0.25)
+    assert controls.place.value == 2.5
+
+
+def test_a_replay_draws_once_in_a_second_and_only_the_plots_that_change(session, server):
+    plots = PassPlots(server, session)
+    plots.tick(0.25)
+    controls = plots.controls
+    assert controls is not None
+    controls.replay.value, controls.speed.value = True, "10x"
+    plot, points = controls.plots["outbox_frames"], []
+    for _ in range(9):
+        plots.tick(0.25)
+        points.append(len(plot.data[0]))
+    assert points == [1, 1, 1, 1, 3, 3, 3, 3, 5]  # of values that come every 10 s
+    controls.speed.value = "1x"
+    before = plot.data, plot.scales
+    for _ in range(8):
+        plots.tick(0.25)
+    assert plot.data is before[0] and plot.scales is before[1]
+    controls.place.value = 55.0  # who moves the slider sees at once what was known there
+    plots.tick(0.25)
+    assert len(plot.data[0]) == 11
+
+
 def test_the_slider_of_a_replay_shows_tenths_of_seconds_and_loses_no_time(tmp_path, server):
     """Housekeeping of 17.12796 s; at 1x a quarter of a second passes between two looks, which is no whole tenth."""
     last = packet(0) | {"utc_ns": 17_127_960_000}

@@ -30,6 +30,7 @@ EVENTS_SHOWN = 30
 PLOT_PX, PANEL_PX = 120, 330
 TOP_PX = 12  # beside which the topmost number of an axis, and the last one, are whole
 STEPS_A_SECOND = 10  # of the slider; the replay itself goes on between them
+DRAWN_EVERY_S = 1.0  # of a replay's viewers' time: a page that is sent plots more often lags behind
 SPEEDS = {"1x": 1.0, "10x": 10.0, "100x": 100.0, "1000x": 1000.0}
 SEVERITY_COLOURS = {"info": "inherit", "warning": LIMIT_COLOURS["yellow"], "error": LIMIT_COLOURS["red"]}
 
@@ -107,7 +108,7 @@ class Controls:
 
 
 class PassPlots:
-    """A panel with the telemetry of a session.
+    """A panel with the telemetry of a session. Only `tick` draws, so that its last state is the one that is seen.
 
     Args:
         on_time: told the time of a replay by the clock of the frames, Unix ns, as it goes on.
@@ -127,7 +128,10 @@ class PassPlots:
         self._read: tuple[int, ...] = ()  # sizes of the files as they were read
         self._series: list[Series] = []
         self._events: list[Event] = []
+        self._is_replaying = False
         self._replayed_s = self._shown_s = 0.0  # how far the replay is, and what the slider says of it
+        self._drawn_to_s = np.inf  # of the pass
+        self._since_drawn_s = 0.0  # of the viewers' time
         self.controls: Controls | None = None  # None before the first housekeeping
 
     def tick(self, elapsed_s: float) -> None:
@@ -147,18 +151,32 @@ class PassPlots:
         controls = self.controls
         end_s = max(float(self._series[0].seconds[-1]), *(event.seconds for event in self._events), 0.0)
         controls.place.max = max(math.ceil(end_s * STEPS_A_SECOND) / STEPS_A_SECOND, 1.0)
-        if controls.replay.value:
-            if controls.place.value != self._shown_s:  # someone has moved the slider
-                self._replayed_s = float(controls.place.value)
-            self._replayed_s += elapsed_s * SPEEDS.get(controls.speed.value, 1.0)
-            self._replayed_s = min(self._replayed_s, end_s)
-            self._shown_s = math.ceil(self._replayed_s * STEPS_A_SECOND) / STEPS_A_SECOND
-            controls.place.value = self._shown_s
-            if (utc_ns := self._time_of_frames()) is not None:
-                self._on_time(utc_ns)
-            self._draw(controls, self._replayed_s)
-        elif changed:
+        was_replaying, self._is_replaying = self._is_replaying, controls.replay.value
+        is_due = changed or was_replaying != self._is_replaying
+        if self._is_replaying:
+            if (
+                not was_replaying and controls.place.value >= controls.place.max
+            ):  # once more, from the beginning
+                controls.place.value = self._shown_s = self._replayed_s = 0.0
+            moved = self._go_on(controls, elapsed_s, end_s)
+            self._since_drawn_s += elapsed_s
+            late = self._since_drawn_s >= DRAWN_EVERY_S or self._replayed_s == end_s
+            if is_due or moved or (late and self._drawn_to_s != self._replayed_s):
+                self._draw(controls, self._replayed_s)
+        elif is_due:
             self._draw(controls, np.inf)
+
+    def _go_on(self, controls: Controls, elapsed_s: float, end_s: float) -> bool:
+        """Let a replay go on by so many seconds of its viewers' time; return whether someone has moved the slider."""
+        if moved := controls.place.value != self._shown_s:
+            self._replayed_s = float(controls.place.value)
+        self._replayed_s += elapsed_s * SPEEDS.get(controls.speed.value, 1.0)
+        self._replayed_s = min(self._replayed_s, end_s)
+        self._shown_s = math.ceil(self._replayed_s * STEPS_A_SECOND) / STEPS_A_SECOND
+        controls.place.value = self._shown_s
+        if (utc_ns := self._time_of_frames()) is not None:
+            self._on_time(utc_ns)
+        return moved
 
     @property
     def _is_one_clock(self) -> bool:
@@ -196,7 +214,6 @@ class PassPlots:
             controls = Controls(
                 replay, speed, place, gui.add_html(""), {s.item.name: self._plot(s) for s in self._series}
             )
-        replay.on_update(lambda _: self._begin(controls))
         panel.dock_left()
         panel.set_width(PANEL_PX)
         return controls
@@ -217,23 +234,19 @@ class PassPlots:
         )
 
     def _draw(self, controls: Controls, seconds: float) -> None:
-        """Draw plots and events as they were known at a time."""
+        """Draw plots and events as they were known at a time; what is drawn so already is not sent again."""
+        self._drawn_to_s, self._since_drawn_s = seconds, 0.0
         known = [up_to(series, seconds) for series in self._series]
         for whole, series in zip(self._series, known, strict=True):
             plot, data = controls.plots[series.item.name], plotted(series, whole)
             if len(data) != len(plot.series):  # a limit has come near, or is far away now
                 plot.series = drawn_lines(whole)
-            plot.scales = scales_of(series)
-            plot.data = data
+            if (scales := scales_of(series)) != plot.scales:
+                plot.scales = scales
+            if not _are_equal(data, plot.data):
+                plot.data = data
         told = [event for event in self._events if event.seconds <= seconds]
-        controls.told.content = _told(known, told, self._note if controls.replay.value else "")
-
-    def _begin(self, controls: Controls) -> None:
-        """Start a replay from where the slider stands, at its end from the beginning; or show the pass as it is now."""
-        if not controls.replay.value:
-            self._draw(controls, np.inf)
-        elif controls.place.value >= controls.place.max:
-            controls.place.value = 0.0
+        controls.told.content = _told(known, told, self._note if self._is_replaying else "")
 
 
 def drawn_lines(whole: Series) -> tuple[uplot.Series, ...]:
@@ -266,6 +279,10 @@ def plotted(known: Series, whole: Series) -> tuple[np.ndarray, ...]:
     seconds, values = np.repeat(known.seconds, 2)[1:], np.repeat(known.values / factor, 2)[:-1]
     limits = [np.full(len(seconds), bound / factor) for bound, _ in near_limits(whole)]
     return (seconds, values, *limits)
+
+
+def _are_equal(some: tuple[np.ndarray, ...], others: tuple[np.ndarray, ...]) -> bool:
+    return len(some) == len(others) and all(map(np.array_equal, some, others))
 
 
 def _told(known: list[Series], events: list[Event], note: str) -> str:
