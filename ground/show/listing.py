@@ -51,6 +51,7 @@ class RunEntry:
     """One run of a session; figures that it does not have are None.
 
     problem: why its metrics cannot be read, or that it is unfinished; empty for a whole run.
+    state: of a live run that is unfinished: waiting, training or settled; else empty.
     """
 
     name: str
@@ -65,6 +66,7 @@ class RunEntry:
     seconds: float | None
     made_utc: str
     problem: str
+    state: str
 
 
 @dataclass(frozen=True)
@@ -179,14 +181,16 @@ def _runs(session: Path) -> list[RunEntry]:
 def _run_entry(folder: Path) -> RunEntry:
     name, made = folder.name, folder.stat().st_mtime
     metrics: dict[str, Any] = {}
-    problem = ""
+    problem = state = ""
     if name.startswith(".") and name.endswith(".part"):
         name, problem = (
             name[1 : -len(".part")],
             "unfinished: `ground reconstruct` with this name goes on with it",
         )
     elif is_live(folder):
-        problem = f"unfinished, `ground live` with this name goes on with it: {line(read_status(folder))}"
+        facts = read_status(folder)
+        problem = f"unfinished, `ground live` with this name goes on with it: {line(facts)}"
+        state = facts.get("state", "its status cannot be read")
     else:
         try:
             metrics = read_metrics(folder / "metrics.json")
@@ -206,6 +210,7 @@ def _run_entry(folder: Path) -> RunEntry:
         metrics.get("train_seconds"),
         datetime.fromtimestamp(made, UTC).isoformat(timespec="seconds"),
         problem,
+        state,
     )
 
 

@@ -8,6 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from ground import cli
+from ground.run.live.status import LiveStatus
 from ground.run.reconstruct import reconstruct
 from obbgs_core.methods.presets import preset
 
@@ -76,6 +77,18 @@ def test_a_session_given_twice_is_listed_once_and_the_screen_shows_it(passes):
     text = called("list", str(passes), str(passes / "2026" / "pass-12"))
     assert text.count("48 in 16 brackets") == 1
     assert "unfinished" in text and "first" in text
+
+
+def test_a_waiting_live_run_shows_its_state_in_the_table_and_its_whole_status_in_json(tmp_path):
+    shutil.copytree(GOLDEN, tmp_path / "pass")
+    why = "frames.jsonl cannot be read yet: " + "what was expected and what came, " * 6
+    LiveStatus("waiting", why, 0, 0, 0, 0, 0, 0.0, None, None, None, None, 0.0, 0).write(
+        tmp_path / "pass" / "runs" / "live"
+    )
+    table = called("list", str(tmp_path), columns=80)
+    assert "waiting" in table and "expected" not in table
+    ((run,),) = (session["runs"] for session in json.loads(called("list", str(tmp_path), "--json")))
+    assert run["state"] == "waiting" and run["problem"].endswith(why) and "goes on with it" in run["problem"]
 
 
 def test_comparing_runs_names_exactly_the_settings_that_differ(passes, tmp_path):
