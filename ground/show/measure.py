@@ -68,9 +68,10 @@ def measured(model: Model, between: list[np.ndarray] | None = None) -> dict:
         away = np.linalg.norm(points - places, axis=1)
         if away.max() > largest:
             x, y, z = places[away.argmax()]
+            unit = "m" if model.in_metres else "units"
             raise ValueError(
-                f"{x:g},{y:g},{z:g} is {away.max():.3g} from the surface, and all of the body is {largest:.3g} large: "
-                "give a place near the point that is meant"
+                f"{x:g},{y:g},{z:g} is {away.max():.3g} {unit} from the surface, and all of the body is "
+                f"{largest:.3g} {unit} large: give a place near the point that is meant"
             )
         distances.append(length(float(np.linalg.norm(points[1] - points[0]))) | {"points": points.tolist()})
     return {

@@ -25,11 +25,11 @@ def states_time(session: Session, record: FrameRecord) -> bool:
 def with_deviation(value: float, deviation: float) -> str:
     """Return a value and its deviation in words, both to the second digit of the deviation: 0.254 ± 0.099."""
     if not (math.isfinite(value) and math.isfinite(deviation)) or deviation <= 0:
-        return f"{value:.4g} ± {deviation:.2g}"
+        return f"{value:z.4g} ± {deviation:.2g}"
     decimals = max(0, 1 - math.floor(math.log10(float(f"{deviation:.1e}"))))
     if decimals > MOST_DECIMALS:  # a row of zeros is no number that a person reads, and too wide for a phone
-        return f"{value:.1e} ± {deviation:.1e}"
-    return f"{value:.{decimals}f} ± {deviation:.{decimals}f}"
+        return f"{value:z.1e} ± {deviation:.1e}"
+    return f"{value:z.{decimals}f} ± {deviation:.{decimals}f}"
 
 
 def states_scale(session: Session) -> bool:

@@ -75,6 +75,7 @@ def test_sizes_are_those_of_the_mesh(run):
 def test_a_place_that_is_far_from_the_body_is_refused(run):
     done = call("ground", "measure", str(run), "--between=1000,0,1:0,0,-1")
     assert done.returncode == 2 and "1000,0,1 is 9" in done.stderr and len(done.stderr.splitlines()) == 1
+    assert " m from the surface" in done.stderr and " m large: give a place" in done.stderr
 
 
 def test_a_part_of_the_design_that_is_not_there_is_told(run):

@@ -133,6 +133,8 @@ def test_values_are_told_to_the_second_digit_of_their_deviation():
         (0.254, 0.0996): "0.25 ± 0.10",
         (12345.6, 234.0): "12346 ± 234",
         (0.3, 0.0): "0.3 ± 0",
+        (-0.0001, 0.021): "0.000 ± 0.021",
+        (-0.0, 0.0): "0 ± 0",
         (-3.1e-14, 3e-12): "-3.1e-14 ± 3.0e-12",
     }
     assert {pair: with_deviation(*pair) for pair in told} == told
