@@ -306,9 +306,19 @@ def encode_thumbnail(frame: Frame) -> bytes | None:
     return encode_frame(replace(frame, dn=dn), max_error_dn=THUMBNAIL_MAX_ERROR)
 
 
+def saturated_again(frame: Frame, container: bytes) -> Frame:
+    """Return a frame of a container with full scale for readings that NEAR may have moved from there.
+
+    A saturated reading says that there was at least so much light, any other how much there was.
+    """
+    near = int(_header_fields(container)[0][15])
+    full = np.uint16(2**frame.bit_depth - 1)
+    return replace(frame, dn=np.where(frame.dn >= full - near, full, frame.dn)) if near else frame
+
+
 def _frame_from(fields: tuple, codestream: bytes, pixel_crc: int) -> Frame:
     (frame_id, bracket_id, index, count, flags, exposure_s, mid_ns) = fields[3:10]
-    (height, width, channels, bit_depth, codec, _near, source, attitude, black_dn, saturated) = fields[10:20]
+    (height, width, channels, bit_depth, codec, near, source, attitude, black_dn, saturated) = fields[10:20]
     numbers = np.array(fields[20:56])
     if (
         codec != CODEC_JPEG_LS
@@ -326,6 +336,8 @@ def _frame_from(fields: tuple, codestream: bytes, pixel_crc: int) -> Frame:
         raise CrcMismatch("the decoded pixels do not fit their CRC-32")
     if not np.isfinite(numbers).all():  # before any sum: NumPy warns of a signalling NaN
         raise PacketError(f"frame {frame_id}: a number of the pose is not finite")
+    if near and bit_depth < 16:
+        dn = np.minimum(dn, np.uint16(2**bit_depth - 1))  # NEAR may have moved a reading beyond
     covariance = np.zeros((6, 6))
     covariance[TRIANGLE] = numbers[10:31]
     covariance = covariance + np.tril(covariance, -1).T

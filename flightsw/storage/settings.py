@@ -52,14 +52,16 @@ def load_settings(folder: Path, mission: Mission) -> Settings:
 
     They stand twice, with checksums. Where neither copy is good, flight is in safe mode with the mission's own
     settings: an unreadable safe mode means safe. That is kept, so that it is said once, and the damaged files are set
-    aside.
+    aside, unless `fsck` has done so before.
     """
     default = Settings(mission.link.priority)
     path = folder / FILE
     try:
         tree = read_twice(path, log.warning)
         if tree is None:
-            return default
+            if not any((folder / "quarantine").glob(f"*-{FILE}")):
+                return default
+            raise ValueError("fsck set both copies aside")
         if tree["exposure_times_ms"] is not None:
             tree["exposure_times_ms"] = tuple(map(float, tree["exposure_times_ms"]))
         tree["max_error_dn"] = tree.pop("near")

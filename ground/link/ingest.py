@@ -12,7 +12,7 @@ from typing import Any
 
 import imagecodecs
 
-from flightsw.icd.frame import Frame, decode_frame
+from flightsw.icd.frame import Frame, decode_frame, saturated_again
 from flightsw.icd.link.auth import Key
 from flightsw.icd.link.can import GROUND_SIDE
 from flightsw.icd.link.framing import PacketStream
@@ -269,7 +269,7 @@ class _Ingest:
                 self._keep_thumbnail(frame)
                 return Verdict.STORED
             self.flight_outbox = None
-            is_new = self._writer.add(frame, container)
+            is_new = self._writer.add(saturated_again(frame, container), container)
         except (PacketError, SessionError) as error:
             self._rejected += 1
             log.warning("frame rejected, the spacecraft keeps it: %s", error)

@@ -13,7 +13,7 @@ from flightsw.cli import app
 from flightsw.errors import StoreError
 from flightsw.icd.frame import decode_frame, encode_frame
 from flightsw.storage.fsck import fsck
-from flightsw.storage.settings import Settings, save_settings
+from flightsw.storage.settings import Settings, load_settings, save_settings
 from flightsw.storage.store import FrameStore
 
 COUNT = 5
@@ -222,6 +222,16 @@ def test_of_what_stands_twice_the_good_copy_replaces_the_damaged_one(folder):
     assert "so is its copy" in problem and not path.exists() and not copy.exists()
     kept = {found.read_bytes() for found in (folder / "quarantine").iterdir()}
     assert kept == {b"{}"}
+
+
+def test_settings_that_were_set_aside_mean_safe_mode_until_the_ground_says_otherwise(folder, small_mission):
+    save_settings(folder, Settings("oldest", safe_mode=True))
+    for damaged in (folder / "settings.json", folder / "settings.json.copy"):
+        damaged.write_bytes(b"{}")
+    fsck(folder)
+    assert load_settings(folder, small_mission).safe_mode
+    save_settings(folder, Settings("oldest"))
+    assert not load_settings(folder, small_mission).safe_mode
 
 
 def test_a_container_that_came_back_after_its_frame_was_deleted_goes_again(folder):

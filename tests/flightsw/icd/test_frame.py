@@ -24,6 +24,7 @@ from flightsw.icd.frame import (
     encode_thumbnail,
     header_of,
     read_header,
+    saturated_again,
 )
 
 # an optional header that other writers of JPEG-LS put first (ISO 14495-1, annex F of part 2)
@@ -93,6 +94,19 @@ def test_near_bounds_the_error_of_every_pixel(make_frame, channels):
     frame = make_frame(1, channels=channels)
     error = decode_frame(encode_frame(frame, max_error_dn=2)).dn.astype(int) - frame.dn
     assert 0 < np.abs(error).max() <= 2
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_readings_at_full_scale_are_saturated_again_after_near(make_frame, channels):
+    dn = make_frame(1, channels=channels).dn
+    frame = dataclasses.replace(make_frame(1), dn=np.where(dn > 3000, np.uint16(4095), np.minimum(dn, 4000)))
+    container = encode_frame(frame, max_error_dn=3)
+    decoded = decode_frame(container)
+    assert decoded.dn.max() <= 4095 and (decoded.dn[frame.dn == 4095] < 4095).any()
+    again = saturated_again(decoded, container)
+    np.testing.assert_array_equal(again.dn == 4095, frame.dn == 4095)
+    lossless = encode_frame(frame)
+    np.testing.assert_array_equal(saturated_again(decode_frame(lossless), lossless).dn, frame.dn)
 
 
 @given(st.data())
