@@ -110,7 +110,9 @@ def uplink_command(
             print(json.dumps(result), flush=True)
         else:
             before = f"{words}: " if script is not None else ""
-            for report in result["reports"] or [result]:
+            reports = result["reports"]
+            ended = reports and reports[-1]["stage"] == result["stage"]
+            for report in reports if ended else [*reports, result]:
                 print(f"{before}{report['stage']}: {report['text']}", flush=True)
         if result["stage"] != "completed":
             if not json_ and place < len(made):

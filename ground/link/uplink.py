@@ -514,7 +514,13 @@ class Uplinker:
             if counter not in counters:
                 del self.jobs[counter]  # withdrawn
             elif self._elapsed_ns() > job.expires_ns and model_file_name(counter) not in self.files.in_flight:
-                self._end(job, "failed", "no answer in time" if not job.reports else f"still {job.stage}")
+                self._end(
+                    job,
+                    "failed",
+                    "no answer in time"
+                    if not job.reports
+                    else f"still {job.stage} when its time was up; give more by --timeout",
+                )
 
     def _read(self, counter: int) -> Job:
         tree = parse_line(_content(self._folder / f"{counter:020d}.json", MAX_JOB_BYTES))

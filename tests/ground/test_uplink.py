@@ -665,3 +665,16 @@ def test_a_negative_number_is_an_argument_out_of_range_and_no_unknown_option(wor
     assert isinstance(error, (ValueError, USAGE_ERROR))
     said = getattr(error, "format_message", error.__str__)()
     assert said.startswith(told), said
+
+
+def test_a_command_that_was_started_and_never_ended_is_told_as_failed(tmp_path, monkeypatch):
+    reports = [{"stage": stage, "text": "model"} for stage in ("accepted", "started")]
+    text = "still started when its time was up; give more by --timeout"
+    result = {"reports": reports, "stage": "failed", "text": text}
+    monkeypatch.setattr("ground.commands.uplink._sent", lambda *_: result)
+    words = ["uplink", "ping", "--session", str(tmp_path), "--link", "serial:///dev/none", "--key", "none"]
+    done = CliRunner().invoke(cli.app, words)
+    assert done.exit_code == 1
+    assert done.stdout.splitlines() == ["accepted: model", "started: model", f"failed: {text}"]
+    reports.append({"stage": "failed", "text": "refused"})
+    assert CliRunner().invoke(cli.app, words).stdout.splitlines()[2:] == ["failed: refused"]
