@@ -75,8 +75,8 @@ def measure_command(
 ) -> None:
     """Measure a run's body: its largest dimension, the sizes and areas of its flat faces, and distances, with errors.
 
-    Intervals hold the true value with a probability of 90 %: they count the error of the scale, which is that of the
-    stated ranges, and that of the edges in the model.
+    Intervals hold the true value with a probability of 90 %: they count the errors of the scale, that of the stated
+    ranges, and of edges in the model. Faces are their seen, uncovered parts.
 
     Example: ground measure pass-12/runs/first --between 0,0,1:0,0,-1
     """

@@ -6,6 +6,7 @@ from ground.show.inspection import Model
 from obbgs_core.inspect.faces import (
     area_half_width,
     flat_faces,
+    is_flat,
     largest_dimension,
     length_half_width,
     nearest_on,
@@ -59,7 +60,12 @@ def measured(model: Model, between: list[np.ndarray] | None = None) -> dict:
             "area": {"value": face.area_m2, "half_width_90": area_half_width(face, pixel_m, deviation)},
         }
         for number, face in enumerate(
-            (f for f in flat_faces(model.surface) if _is_known(length(float(f.extent[1])))), 1
+            (
+                face
+                for face in flat_faces(model.surface)
+                if _is_known(length(float(face.extent[1]))) and is_flat(face, model.surface)
+            ),
+            1,
         )
     ]
     distances = []

@@ -17,6 +17,8 @@ FACING = 0.9  # cosine between the normals of a face and of its points, at least
 LEAST_AREA_PX = 60.0  # of a face, in squares of a pixel
 MOST_FACES = 16
 LINKED_PX = 1.5
+# by which a face bends at most: those of bodies with flat ones bend by 0.15, strips of dishes and hulls by 0.6 and more
+BEND_PX = 0.3
 NARROW = 0.5  # of a face's usual width: a strip of it that is narrower is something that joins it
 
 
@@ -120,6 +122,15 @@ def _ends(along: np.ndarray, covers: np.ndarray, pixel_m: float) -> tuple[float,
     after = share[last] if last < len(share) else 0.0
     begin, end = low + (first - before) * pixel_m, low + (last + after) * pixel_m
     return max(begin, low), min(end, float(along.max()))
+
+
+def is_flat(face: Face, surface: Surface) -> bool:
+    """Return whether a face is flat, and no strip of a curved surface that lies within the errors of a plane."""
+    along, across, off = ((surface.points[face.members] - face.middle) @ face.axes.T).T / surface.pixel_m
+    bends = np.stack([along**2, along * across, across**2], axis=1)
+    plane = np.stack([np.ones(len(off)), along, across], axis=1)
+    fitted = np.linalg.lstsq(np.concatenate([plane, bends], axis=1), off)[0]
+    return bool(np.ptp(bends @ fitted[3:]) < BEND_PX)
 
 
 def faces_as_parts(mesh: CadMesh, pixel_m: float) -> CadMesh:

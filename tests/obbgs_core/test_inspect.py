@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from obbgs_core.errors import ReconstructionError
 from obbgs_core.inspect.alignment import Surface, aligned
 from obbgs_core.inspect.cad import CadError, CadMesh, read_cad, sampled
-from obbgs_core.inspect.faces import flat_faces, largest_dimension
+from obbgs_core.inspect.faces import flat_faces, is_flat, largest_dimension
 from obbgs_core.inspect.findings import Inspection, inspect
 from obbgs_core.inspect.plates import Plate, Turn, is_turned, plates_of
 from obbgs_core.inspect.shown import Views
@@ -121,6 +121,16 @@ def test_sizes_are_those_of_the_box_that_trimesh_made():
     assert largest.area_m2 == pytest.approx(1.2 * 0.8, rel=0.05)
     diagonal, _ = largest_dimension(surface.points)
     assert diagonal == pytest.approx(np.linalg.norm([1.2, 0.8, 0.5]), abs=2 * PIXEL_M)
+
+
+def test_strips_of_a_hull_that_lie_within_the_errors_of_a_plane_are_no_flat_faces():
+    hull = trimesh.creation.cylinder(radius=0.6, height=1.5, sections=200)
+    surface, _ = seen(trimesh.Scene(hull), noise_px=0.1)
+    # what is narrower is left of the strips between others
+    faces = [face for face in flat_faces(surface) if face.extent[1] > 9 * PIXEL_M]
+    ends = [bool(abs(face.axes[2][2]) > 0.9) for face in faces]
+    assert len(faces) > 4 and 0 < sum(ends) <= 2
+    assert [is_flat(face, surface) for face in faces] == ends
 
 
 def test_what_joins_a_face_and_is_narrower_does_not_make_it_longer():

@@ -33,8 +33,8 @@ def sizes_section(run: Run) -> str:
         f"edges in the model, whose pixels are {values['pixel']:.2g} {unit} wide."
     )
     note += (
-        " Faces are the flat ones that the frames show, largest first, without those too small for their width "
-        "to be known to a quarter."
+        " Faces are what the frames show of flat ones, without what stands on them or hides them, largest first, "
+        "if their width is known to a quarter."
         if values["faces"]
         else " The frames show no flat face that is large enough to be measured."
     )
