@@ -9,8 +9,9 @@ from flightsw.cameras.camera import Camera
 from flightsw.capture.bracket import AutoBracket, Geometry
 from flightsw.capture.region import region_of_interest
 from flightsw.errors import CameraLost, CaptureError, FlightError, OrbitError, StoreFull
-from flightsw.icd.frame import Frame, PoseTag, decode_frame
+from flightsw.icd.frame import HEADER, Frame, PoseTag, decode_frame, header_of, read_header
 from flightsw.icd.mission import Mission
+from flightsw.icd.packet import PacketError
 from flightsw.navigation.pose import PoseTagger, pose_tag
 from flightsw.storage.settings import Settings
 from flightsw.storage.store import FrameStore
@@ -66,12 +67,16 @@ def plan(
     """
     bracket = mission.bracket
     for bracket_id in range(bracket.count):
-        trigger_ns = mission.orbit.start_utc_ns + round(bracket_id * bracket.interval_s * NS)
+        trigger_ns = _trigger_utc_ns(mission, bracket_id)
         exposures_s = sorted(times_s(trigger_ns) or bracket.exposure_times_s)
         spacing_s = bracket.spacing_s(len(exposures_s))
         for index, exposure_time_s in enumerate(exposures_s):
             start_ns = trigger_ns + round(index * spacing_s * NS)
             yield Shot(bracket_id, index, len(exposures_s), exposure_time_s, start_ns)
+
+
+def _trigger_utc_ns(mission: Mission, bracket_id: int) -> int:
+    return mission.orbit.start_utc_ns + round(bracket_id * mission.bracket.interval_s * NS)
 
 
 def capture(
@@ -215,6 +220,7 @@ class _BracketTimes:
         settings: Callable[[], Settings] | None,
     ):
         self._mission, self._wait_until, self._settings = mission, wait_until, settings
+        self._begun = _BegunBrackets(mission, store)
         self._auto = AutoBracket(mission.camera, mission.bracket)
         self._taken: list[Frame] = []
         self._last_seen: Geometry | None = None
@@ -233,7 +239,15 @@ class _BracketTimes:
         self._taken.append(frame)
 
     def at(self, trigger_utc_ns: int) -> tuple[float, ...]:
-        """Return the exposure times of a bracket once it is due; empty for the mission's own."""
+        """Return the exposure times of a bracket once it is due; empty for the mission's own.
+
+        A bracket that an earlier start began keeps its number of exposures, whatever has been commanded since.
+        """
+        if (held := self._begun.whole(trigger_utc_ns)) is not None:
+            return held
+        return self._begun.completed(trigger_utc_ns, self._next(trigger_utc_ns))
+
+    def _next(self, trigger_utc_ns: int) -> tuple[float, ...]:
         # before the wait, since it takes time
         times_s = self._automatic(trigger_utc_ns) if self._mission.bracket.auto else ()
         self._wait_until(trigger_utc_ns)
@@ -254,3 +268,64 @@ class _BracketTimes:
         except OrbitError as error:
             log.warning("exposure times of the mission file: %s", error)
             return ()
+
+
+class _BegunBrackets:
+    """How many exposures each bracket of an earlier start consists of, and their times, as the store tells.
+
+    Headers of stored frames say both. Where a bracket's frames were all deleted, or cannot be read, it had at least
+    as many exposures as were stored; the last one may have been interrupted, and is planned as a new one is.
+    """
+
+    def __init__(self, mission: Mission, store: FrameStore):
+        self._mission, self._store = mission, store
+        self._least = store.begun_brackets()
+        self._last = max(self._least, default=-1)
+        self._brackets = {_trigger_utc_ns(mission, bracket_id): bracket_id for bracket_id in self._least}
+        self._frames: dict[int, list[int]] = {}
+        for stored in store.frames if self._least else ():
+            self._frames.setdefault(stored.bracket_id, []).append(stored.frame_id)
+
+    def whole(self, trigger_utc_ns: int) -> tuple[float, ...] | None:
+        """Return as many times as a bracket has exposures if the store holds, or held, all of them."""
+        bracket_id = self._brackets.get(trigger_utc_ns)
+        if bracket_id is None:
+            return None
+        count, known_s = self._planned(bracket_id, all_times=False)
+        if count == 0 or not all(self._store.holds(bracket_id, index) for index in range(count)):
+            return None
+        return (next(iter(known_s.values()), self._mission.bracket.exposure_times_s[0]),) * count
+
+    def completed(self, trigger_utc_ns: int, next_s: tuple[float, ...]) -> tuple[float, ...]:
+        """Return the times of a bracket of which exposures are missing; `next_s` are those that a new one would have.
+
+        Where neither these nor the mission's are as many as the bracket's, an exposure has the time of the nearest one
+        that is known.
+        """
+        bracket_id = self._brackets.get(trigger_utc_ns)
+        if bracket_id is None:
+            return next_s
+        count, known_s = self._planned(bracket_id, all_times=True)
+        own_s = self._mission.bracket.exposure_times_s
+        for times_s in (next_s or own_s, own_s):
+            if count in (0, len(times_s)):
+                return times_s
+        known_s = known_s or dict(enumerate(sorted(next_s or own_s)))
+        return tuple(known_s[min(known_s, key=lambda i: abs(i - index))] for index in range(count))
+
+    def _planned(self, bracket_id: int, all_times: bool) -> tuple[int, dict[int, float]]:
+        """Return how many exposures a bracket has, 0 if that is not known, and the times of those that can be read."""
+        count, known_s = 0, {}
+        for frame_id in self._frames.get(bracket_id, []):
+            try:
+                with open(self._store.path(frame_id), "rb") as container:
+                    header = read_header(header_of(container.read(HEADER.size)))
+            except (OSError, PacketError):
+                continue
+            count = max(count, header["bracket_count"])
+            known_s[header["bracket_index"]] = header["exposure_time_s"]
+            if not all_times:
+                break
+        if count == 0 and bracket_id < self._last:
+            count = self._least[bracket_id]
+        return count, known_s

@@ -127,6 +127,13 @@ class FrameStore:
         """Tell whether this exposure of the pass was stored, even if it has been deleted since."""
         return (bracket_id, bracket_index) in self._exposures
 
+    def begun_brackets(self) -> dict[int, int]:
+        """Return the brackets of which exposures were stored, deleted ones too, and the least that each consists of."""
+        least: dict[int, int] = {}
+        for bracket_id, bracket_index in self._exposures:
+            least[bracket_id] = max(least.get(bracket_id, 0), bracket_index + 1)
+        return least
+
     def put(self, frame: Frame, *, max_error_dn: int = 0, roi_mask: np.ndarray | None = None) -> StoredFrame:
         """Store a frame and put it into the outbox; when this returns, a power cut cannot lose it.
 

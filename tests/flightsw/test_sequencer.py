@@ -227,3 +227,34 @@ def test_a_camera_of_another_size_gives_no_frame_and_says_both_sizes(tmp_path, c
         f"({camera.height}, {camera.width}) pixels, this one ({camera.height - 1}, {camera.width})"
         in caplog.text
     )
+
+
+@pytest.mark.parametrize("later_ms", [(1.0, 2.0, 4.0, 8.0), (1.0,)])
+def test_exposures_commanded_after_a_bracket_are_not_missing_from_it(tmp_path, later_ms):
+    """A restart of a pass that is whole, and of one whose second bracket lacks a frame and whose third all of them."""
+    store, commanded = FrameStore(tmp_path / "whole"), Settings("oldest", exposure_times_ms=later_ms)
+    capture(MISSION, Sky(), store)
+    for bracket_id in (0, 1):  # one bracket was deleted, of another one frame
+        store.drop(bracket_id * 4)
+    for frame_id in (1, 2):
+        store.drop(frame_id)
+    again = capture(MISSION, Sky(failing=tuple(range(99))), store, settings=lambda: commanded)
+    assert (again.planned, again.already_stored, again.failed) == (48, 48, 0)
+    store = FrameStore(tmp_path / "lacking")
+    capture(MISSION, Sky(failing=(4, 6, 7, 8)), store)
+    camera = Sky()
+    again = capture(MISSION, camera, FrameStore(tmp_path / "lacking"), settings=lambda: commanded)
+    assert (again.failed, again.stored) == (0, 1 + len(later_ms))
+    frames = [decode_frame(store.read(stored.frame_id)) for stored in FrameStore(tmp_path / "lacking").frames]
+    (completed,) = (frame for frame in frames[44:] if frame.bracket_id == 1)
+    assert (completed.bracket_index, completed.bracket_count, completed.exposure_time_s) == (1, 3, 1e-4)
+
+
+def test_a_begun_bracket_of_commanded_times_is_completed_when_the_mission_has_fewer(tmp_path):
+    commanded = Settings("oldest", exposure_times_ms=(1.0, 2.0, 4.0, 8.0))
+    mission = dataclasses.replace(MISSION, bracket=dataclasses.replace(MISSION.bracket, count=1))
+    capture(mission, Sky(failing=(1,)), FrameStore(tmp_path), settings=lambda: commanded)
+    counts = capture(mission, Sky(), FrameStore(tmp_path))
+    assert (counts.planned, counts.already_stored, counts.stored) == (4, 3, 1)
+    added = decode_frame(FrameStore(tmp_path).read(3))
+    assert (added.bracket_index, added.bracket_count, added.exposure_time_s) == (1, 4, 1e-3)
