@@ -118,9 +118,8 @@ def _run_cells(run: "RunEntry", imported: bool) -> list[str]:
     poses = (run.poses or "").partition(" (")[0]  # the reason stands in `compare-runs` and in the report
     if run.pose_error_px is not None:
         poses += f", off by {run.pose_error_px:.2g} px, {run.pose_error_deg or 0:.2g}°"
-    problem = (
-        f"unfinished: {run.state}" if run.state else run.problem
-    )  # the whole of a status stands in `--json`
+    # the whole of a status stands in `--json`
+    problem = f"unfinished: {run.state}" if run.state else run.problem
     return [f"  {run.name}", _age(run.made_utc), method, psnr, gaussians, problem or poses]
 
 

@@ -154,9 +154,8 @@ class PassPlots:
         was_replaying, self._is_replaying = self._is_replaying, controls.replay.value
         is_due = changed or was_replaying != self._is_replaying
         if self._is_replaying:
-            if (
-                not was_replaying and controls.place.value >= controls.place.max
-            ):  # once more, from the beginning
+            if not was_replaying and controls.place.value >= controls.place.max:
+                # once more, from the beginning
                 controls.place.value = self._shown_s = self._replayed_s = 0.0
             moved = self._go_on(controls, elapsed_s, end_s)
             self._since_drawn_s += elapsed_s
