@@ -43,7 +43,12 @@ def check_link(url: str, loopback: bool, max_packet_bytes: int) -> list[Finding]
     try:
         link = open_link(url, FLIGHT_SIDE)
     except LinkError as error:
-        advice = "look at the device's name (ls -l /dev, ip link) and give this user the group dialout"
+        if parsed.scheme == "can":
+            advice = (
+                "look whether the interface is there and up (ip link); modprobe loads what the kernel lacks"
+            )
+        else:
+            advice = "look at the device's name (ls -l /dev) and give this user the group dialout"
         return [Finding.failed("link", error.problem, END_OTHER if error.remedy == END_OTHER else advice)]
     with link:
         if parsed.scheme == "serial":

@@ -416,3 +416,14 @@ def test_the_command_exits_with_1_where_a_check_failed_and_says_so_in_json(tmp_p
     assert bad.exit_code == 1
     failed = [line for line in bad.stdout.splitlines() if line.startswith("failed")]
     assert len(failed) == 1 and "link" in failed[0] and "ttyX" in failed[0] and " -> look at" in bad.stdout
+
+
+def test_a_can_interface_that_does_not_open_has_nothing_to_do_with_serial_ports(monkeypatch):
+    def refuse(*_, **__) -> None:
+        raise OSError(errno.EAFNOSUPPORT, os.strerror(errno.EAFNOSUPPORT))
+
+    monkeypatch.setattr("can.Bus", refuse)
+    (finding,) = devices.check_link("can://can0", False, 1100)
+    assert finding.state == "failed" and "this kernel has no CAN" in finding.found
+    assert "ip link" in finding.advice and "modprobe" in finding.advice
+    assert "dialout" not in finding.advice and "/dev" not in finding.advice
