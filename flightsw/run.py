@@ -23,7 +23,7 @@ from flightsw.icd.mission import Mission
 from flightsw.ports import Link, open_link
 from flightsw.storage.boot_counter import count_boot
 from flightsw.storage.settings import load_settings
-from flightsw.storage.store import FrameStore, open_store, remove_unused
+from flightsw.storage.store import FrameStore, open_store, remove_unused, require_store
 from flightsw.watchdog import Watchdog, notify
 from obbgs_base.errors import counted
 from obbgs_base.stopping import join
@@ -95,6 +95,8 @@ def run_pass(
         link, keys = _open_link(link_url, key_files, exit_when_empty and camera_url is None, opened)
         if camera_url is not None:
             camera, no_camera = _first_camera(camera_url, mission, stop, opened, is_needed=link is None)
+        if exit_when_empty and camera_url is None:
+            require_store(store_dir)
         is_patient, is_new = link is not None and not exit_when_empty, not store_dir.exists()
         store = open_store(store_dir, mission, open_now=not is_patient)
         if link is not None:

@@ -15,7 +15,7 @@ from flightsw.storage.index import (
     entries_of,
     index_entry,
 )
-from flightsw.storage.store import lock_store, quarantine
+from flightsw.storage.store import lock_store, quarantine, require_store
 from flightsw.storage.transfer_numbers import FILE, numbers_line, parse_numbers, random_number
 from obbgs_base.checked import checked_line, copy_of, parse_checked_line, read_twice
 from obbgs_base.errors import counted, in_words, reason
@@ -103,12 +103,7 @@ class _Check:
 
     def run(self, is_running: bool) -> FsckReport:
         """Check and repair; the files that a running flight software may be writing are left where it runs."""
-        if not (self.folder / "frames").is_dir():
-            raise StoreError(f"{self.folder} is no frame store: it has no folder frames/")
-        if (self.folder / "session.json").exists():
-            raise StoreError(
-                f"{self.folder} is a session of the ground, no frame store: give flight's store with --store"
-            )
+        require_store(self.folder)
         try:
             for path in self._container_paths():  # without the lock, since it takes long
                 self._look_at(path)

@@ -637,6 +637,22 @@ def open_store(folder: Path, mission: Mission, open_now: bool = True) -> FrameSt
     return FrameStore(folder, mission.store.quota_bytes, mission.store.when_full, open_now)
 
 
+def require_store(folder: Path) -> None:
+    """Raise what is wrong with a folder that must be a frame store already.
+
+    Raises:
+        StoreError: it is none, or not there.
+    """
+    if not (folder / "frames").is_dir():
+        raise StoreError(
+            f"{folder} is no frame store: it has no folder frames/; give flight's store with --store"
+        )
+    if (folder / "session.json").exists():
+        raise StoreError(
+            f"{folder} is a session of the ground, no frame store: give flight's store with --store"
+        )
+
+
 def remove_unused(folder: Path) -> None:
     """Remove a store that holds nothing but what is made at a start; one with frames, settings or an index stays."""
     at_start = {"frames", "outbox", "lock", RESERVE}

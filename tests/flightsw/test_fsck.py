@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import tty
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -34,6 +35,18 @@ def test_a_sound_store_is_left_alone(folder):
     report = fsck(folder)
     assert (report.frames, report.waiting, report.problems) == (COUNT, COUNT - 1, [])
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+def test_a_downlink_that_ends_when_all_is_sent_makes_no_store_of_a_misspelt_name(tmp_path, small_mission):
+    ours, theirs = os.openpty()
+    tty.setraw(theirs)
+    arguments = ["downlink", "--link", f"serial://{os.ttyname(theirs)}", "--exit-when-empty"]
+    arguments += ["--mission", str(tmp_path / "small.yaml"), "--store", str(tmp_path / "misspelt")]
+    done = CliRunner().invoke(app, arguments)
+    os.close(ours)
+    os.close(theirs)
+    assert isinstance(done.exception, StoreError) and "misspelt is no frame store" in str(done.exception)
+    assert not (tmp_path / "misspelt").exists()
 
 
 def break_temporary(folder):
