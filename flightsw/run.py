@@ -335,7 +335,6 @@ class _DownlinkThread(threading.Thread):
         self._exit_when_empty, self._stop_event = exit_when_empty, stop
         self._on_progress, self._watchdog = on_progress, watchdog
         self._empty_since_s: float | None = None
-        self._failures_told = 0  # of this start, to the ground
 
     def run(self) -> None:
         try:
@@ -365,15 +364,11 @@ class _DownlinkThread(threading.Thread):
             state = "capturing"
         else:
             state = "pass done" if self.captured.planned else "none"
-        counts = self.captured
-        last, failures = (
-            (counts.last_bracket, counts.last_index),
-            counts.newly_failed,
-        )  # in this order: capture goes on
-        if failures > self._failures_told and self._link.connected:
-            self._failures_told = failures
-            self.store.note_told(*last)
-        return {"camera": state, "frames_failed": failures, "frames_refused": counts.refused}
+        return {
+            "camera": state,
+            "frames_failed": self.captured.failed,
+            "frames_refused": self.captured.refused,
+        }
 
     def _keep(self, now: DownlinkProgress) -> None:
         self.result = now

@@ -33,10 +33,6 @@ class Shot:
     start_utc_ns: int
 
     @property
-    def place(self) -> tuple[int, int]:
-        return self.bracket_id, self.bracket_index
-
-    @property
     def mid_exposure_utc_ns(self) -> int:
         return self.start_utc_ns + round(self.exposure_time_s * NS / 2)
 
@@ -49,11 +45,6 @@ class CaptureCounts:
     stored: int = 0
     already_stored: int = 0
     failed: int = 0
-    newly_failed: int = 0  # of the failed ones: the ground was not told of them by an earlier start
-    last_bracket: int = (
-        -1
-    )  # with the next one: the planned exposure that was the last to be taken or not taken
-    last_index: int = -1
     lost_with_camera: int = 0  # of the failed ones: the camera did not answer
     brackets_short: int = 0  # brackets that lack such exposures
     refused: int = 0  # taken, but the store is full
@@ -65,14 +56,6 @@ class CaptureCounts:
     outside_ephemeris: int = 0
     navigation_gaps: int = 0
     packets_lost: int = 0  # between camera and computer
-
-    def end(self, shot: Shot, tagger: PoseTagger) -> None:
-        """Count a planned exposure, whatever became of it, and what was found with its tag."""
-        self.last_bracket, self.last_index = shot.place
-        self.planned += 1
-        self.stale_elements = tagger.stale_elements
-        self.outside_ephemeris = tagger.outside_ephemeris
-        self.navigation_gaps = tagger.navigation_gaps
 
 
 def plan(
@@ -120,7 +103,7 @@ def capture(
     """
     counts = CaptureCounts()
     store.hold_pass(mission.orbit.start_utc_ns)
-    dropped_before, told_until, tagger = store.dropped_undelivered, store.told_until(), PoseTagger(mission)
+    dropped_before, tagger = store.dropped_undelivered, PoseTagger(mission)
     times = _BracketTimes(mission, store, wait_until, settings)
     failures = _Repeats("more exposure", "lost for the same reason")
     refusals = _Repeats("more frame", "refused")
@@ -163,11 +146,12 @@ def capture(
                 if commanded is not None and commanded.safe_mode:
                     counts.skipped += 1
                 else:
-                    failed = counts.failed
                     take(shot, commanded.max_error_dn if commanded else 0)
-                    counts.newly_failed += counts.failed > failed and shot.place > told_until
-            counts.end(shot, tagger)
+            counts.planned += 1
             counts.dropped = store.dropped_undelivered - dropped_before
+            counts.stale_elements = tagger.stale_elements
+            counts.outside_ephemeris = tagger.outside_ephemeris
+            counts.navigation_gaps = tagger.navigation_gaps
             on_frame(counts)
     finally:
         failures.end()

@@ -298,30 +298,6 @@ class FrameStore:
                     lambda file, data: write_with_reserve(file, data, self.folder / RESERVE),
                 )
 
-    def told_until(self) -> tuple[int, int]:
-        """Return up to which exposure of the pass the ground was told of those that failed: bracket, place in it."""
-        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-            bracket_id, bracket_index = (read_twice(self.folder / "pass.json", log.warning) or {})[
-                "told_until"
-            ]
-            return int(bracket_id), int(bracket_index)
-        return -1, -1
-
-    def note_told(self, bracket_id: int, bracket_index: int) -> None:
-        """Note that the ground was told which exposures failed up to this one: no later start counts them again.
-
-        Where the disk refuses, they are counted again.
-        """
-        path = self.folder / "pass.json"
-        with self._told("note which exposures failed"), self.locked(), contextlib.suppress(ValueError):
-            tree = read_twice(path, log.warning)
-            if tree is not None and self.told_until() < (bracket_id, bracket_index):
-                write_twice(
-                    path,
-                    tree | {"told_until": [bracket_id, bracket_index]},
-                    lambda file, data: write_with_reserve(file, data, self.folder / RESERVE),
-                )
-
     def mark_delivered(self, frame_id: int) -> None:
         """Take a frame out of the outbox; the frame itself stays until its room is needed.
 

@@ -7,7 +7,6 @@ import shutil
 import threading
 import time
 import tty
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import imagecodecs
@@ -16,17 +15,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flightsw.cameras.camera import Exposure
 from flightsw.downlink.loop import run_downlink
-from flightsw.errors import CaptureError
 from flightsw.icd.frame import HEADER, encode_frame
-from flightsw.icd.link.can import GROUND_SIDE
-from flightsw.icd.link.framing import PacketStream, frame_packet
-from flightsw.icd.mission import load_mission
-from flightsw.icd.packet import APID_FRAME_HEADERS, APID_HOUSEKEEPING, TELECOMMAND
-from flightsw.icd.telemetry import DICTIONARY
-from flightsw.ports import SerialLink, open_link
-from flightsw.run import run_pass
+from flightsw.icd.link.framing import frame_packet
+from flightsw.icd.packet import APID_FRAME_HEADERS
+from flightsw.ports import SerialLink
 from flightsw.storage.store import FrameStore
 from ground.formats.pictures.views import Intrinsics, View, write_session
 from ground.link.ingest import listen
@@ -137,41 +130,6 @@ def test_the_count_is_never_more_than_was_taken_and_exact_once_all_is_heard(data
             counts = counts.after_housekeeping(values)
         assert (counts.frames_refused, counts.frames_failed) == (refused, failed)
         assert counts.captured() == stored + refused
-
-
-def test_an_exposure_that_failed_is_counted_once_however_often_flight_starts(tmp_path, monkeypatch):
-    """A camera that fails always: each start of flight asks it for the whole pass again, which is longer at last."""
-
-    class Stuck:
-        has_own_clock, packets_lost = True, 0
-
-        def open(self) -> None:
-            pass
-
-        def expose(self, exposure_time_s: float, start_utc_ns: int) -> Exposure:
-            raise CaptureError("the shutter is stuck")
-
-        def close(self) -> None:
-            pass
-
-    monkeypatch.setattr("flightsw.run.open_camera", lambda url, camera: Stuck())
-    mission, counts, failed = load_mission(GOLDEN.parent / "mission.yaml"), FlightCounts(), []
-    longer = dataclasses.replace(mission, bracket=dataclasses.replace(mission.bracket, count=17))
-    stream = PacketStream(TELECOMMAND, 1100)
-    with VirtualSerial(921_600) as line, open_link(line.ground_url, GROUND_SIDE) as ground:
-        for planned in (mission, mission, longer):
-            options = {"camera_url": "stuck://", "link_url": line.flight_url, "exit_when_empty": True}
-            with ThreadPoolExecutor(1) as pool:
-                run = pool.submit(run_pass, planned, tmp_path / "store", threading.Event(), **options)
-                heard: list = []
-                while not run.done() or heard:
-                    heard = stream.decode(ground.exchange(0.2))
-                    for apid, data in heard:
-                        if apid == APID_HOUSEKEEPING:
-                            counts = counts.after_housekeeping(DICTIONARY.unpack("telemetry", data)[1])
-            assert run.result().captured.failed == 3 * planned.bracket.count
-            failed.append(counts.frames_failed)
-    assert failed == [48, 48, 51] and counts.run_boot == 3
 
 
 def test_a_header_without_its_frame_tells_of_it(tmp_path, make_frame):
