@@ -90,7 +90,8 @@ def _typed(value: Any, hint: Any, name: str) -> Any:
     """
     try:
         if typing.get_origin(hint) is not tuple:
-            return plain(value, hint)
+            is_nan = hint is float and isinstance(value, float) and math.isnan(value)
+            return value if is_nan else plain(value, hint)  # which is out of every range
         items, hints = as_items(value), typing.get_args(hint)
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None

@@ -63,4 +63,4 @@ def export_colmap(session: Session, out: Path, surface: np.ndarray | None = None
     for name, entries in (("cameras", cameras), ("images", images), ("points3D", points)):
         write_whole(model / f"{name}.bin", struct.pack("<Q", len(entries)) + b"".join(entries))
     write_whole(model / "test.txt", "".join(held_out).encode())
-    return {"train": counts["train"], "test": len(held_out)}
+    return {"train": counts["train"], "val": 0, "test": len(held_out)}

@@ -78,9 +78,10 @@ def whole(
     """
     damaged = {record.id for record in records if not session.is_whole(record)}
     if damaged:
+        one = len(damaged) == 1
+        what = "the picture of 1 frame is" if one else f"the pictures of {len(damaged):,} frames are"
         on_warning(
-            f"left out, as the picture is damaged: {counted(len(damaged), 'frame')}, "
-            f"{', '.join(map(str, sorted(damaged)))}; "
+            f"{what} damaged and left out: {', '.join(map(str, sorted(damaged)))}; "
             "`ground uplink resend` asks for what is still on board"
         )
     return [record for record in records if record.id not in damaged]

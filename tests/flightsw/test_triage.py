@@ -106,7 +106,7 @@ def test_command_prints_the_ranking(model, tmp_path):
     result = CliRunner().invoke(app, [*arguments[:-1], "--mission", str(GOLDEN / "mission.yaml")])
     title, row = result.stdout.splitlines()[:2]
     assert title.startswith("rank  frame") and row.split()[:2] == ["1", "3"]
-    assert "1 containers could not be read" in result.stderr
+    assert "1 container could not be read" in result.stderr
 
 
 def test_a_saturated_pixel_counts_only_when_the_model_is_darker():

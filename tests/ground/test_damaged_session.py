@@ -182,4 +182,4 @@ def test_a_damaged_picture_costs_its_frame_alone_when_a_model_is_made(session, c
     flip(session / "frames" / "000002.png", 1000)
     training, held_out = split(open_session(session))
     assert {record.id for record in training + held_out} == {0, 1, 3}
-    assert "left out, as the picture is damaged: 1 frame, 2;" in caplog.text
+    assert "the picture of 1 frame is damaged and left out: 2;" in caplog.text

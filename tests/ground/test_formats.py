@@ -272,7 +272,7 @@ def test_exact_poses_stay_exact_through_a_colmap_model_and_its_counts_are_those_
     views, exported = read_colmap_and_export(tmp_path / "c")
     write_session(views, tmp_path / "again", "colmap", exported=exported)
     assert not any(record.covariance.any() for record in open_session(tmp_path / "again").frames)
-    assert counts == Counter(view.split for view in views)
+    assert Counter(counts) == Counter(view.split for view in views)
 
 
 def test_the_points_of_a_colmap_export_lie_on_the_surface_and_colmap_reads_them(tmp_path, session):

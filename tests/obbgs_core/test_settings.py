@@ -16,6 +16,7 @@ from obbgs_core.settings import changed
     ("name", "value", "message"),
     [
         ("rates.means", -1.0, "0 or more, got -1.0"),
+        ("rates.means", math.nan, "0 or more, got nan"),
         ("growth.interval", 0, "at least 1, got 0"),
         ("parsimony.prune_at", (0.5, 1.5), "from 0 to 1, got 1.5"),
         ("published.coarse", ((0.5, 12),), "triples of an image scale"),
@@ -35,7 +36,6 @@ def test_settings_that_no_training_can_have_are_refused(name, value, message):
         ("exposure_aware", 1, "true or false, got 1"),
         ("loss.edge_weight", "abc", "a number, got 'abc'"),
         ("loss.edge_weight", True, "a number, got True"),
-        ("rates.means", math.nan, "a number, got nan"),
         ("steps", 2.5, "a whole number, got 2.5"),
         ("steps", "30", "a whole number, got '30'"),
         ("steps", True, "a whole number, got True"),

@@ -45,7 +45,7 @@ def frames_section(run: Run) -> str:
             if record is None:
                 cells.append(label("missing"))
                 continue
-            caption = f"{frame} {record.id}" + _range(run, record)
+            caption = unbroken(f"{frame} {record.id}") + _range(run, record)
             if not is_same:
                 caption += f", {_exposure(run, record)}"
             if record.saturated:
