@@ -23,9 +23,8 @@ def write_whole(path: Path, content: bytes, like: Path | None = None) -> None:
     try:
         part.unlink(missing_ok=True)  # of a command that was killed, with whatever mode
         with open(part, "wb") as file:
-            keep_mode(
-                path if like is None or path.exists() else like, part
-            )  # before there is anything to read in it
+            # before there is anything to read in it
+            keep_mode(path if like is None or path.exists() else like, part)
             file.write(content)
             file.flush()
             os.fsync(file.fileno())

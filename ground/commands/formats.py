@@ -318,9 +318,9 @@ def export_command(
     """Write a session's frames for other software, whole brackets split into train, val and test (6:2:3).
 
     Pictures have 8 bits. Beside them lie the readings of 16 bits, which `ground import` takes with exposure times and
-    the sensor's figures, of a COLMAP folder with the cameras of its model; of a run that has points of the surface. The
-    format ndm writes no pictures, but CCSDS
-    messages: the target's attitude and rate, the camera's attitude and its path about the target with covariance.
+    the sensor's figures, of a COLMAP folder with the cameras of its model, which has points where a run is exported.
+    The format ndm writes no pictures, but CCSDS messages: the target's attitude and rate, the camera's attitude and its
+    path about the target with covariance.
 
     Example: ground export pass-12/runs/first --format nerfstudio --out pass-12-nerfstudio
     """

@@ -105,7 +105,7 @@ def move_counter(path: Path, last_used: int) -> int:
                 raise ConfigError(
                     "--counter", f"expected less than {MAX_COUNTER - COUNTER_MARGIN}, got {last_used}"
                 )
-            _keep_counter(path, key, counter)
+            _keep_counter(sent, key, counter, path)
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(str(path), f"cannot use the key and its counter: {reason(error)}") from error
     return counter
@@ -286,7 +286,7 @@ def _next_counter(key_file: Path, folder: Path) -> Iterator[tuple[Key, int]]:
                 counter += 1
             if counter >= MAX_COUNTER:
                 raise ConfigError(str(sent), "is at its end: make another key with `ground key`")
-            _keep_counter(key_file, key, counter)
+            _keep_counter(sent, key, counter, key_file)
             yield key, counter
     except (FileNotFoundError, PermissionError, UnicodeDecodeError) as error:
         raise ConfigError(str(key_file), f"cannot use the key and its counter: {reason(error)}") from error
@@ -302,9 +302,8 @@ def _locked_counter(key_file: Path) -> Iterator[Path]:
         yield sent
 
 
-def _keep_counter(key_file: Path, key: Key, counter: int) -> None:
+def _keep_counter(sent: Path, key: Key, counter: int, key_file: Path) -> None:
     """Write the ground's counter and its copy; a new file can be read by those who can read the key."""
-    sent = key_file.with_name(key_file.name + ".sent")
     for each in (sent, copy_of(sent)):
         write_whole(each, key.counter_text(counter).encode(), like=key_file)
 
@@ -514,13 +513,8 @@ class Uplinker:
             if counter not in counters:
                 del self.jobs[counter]  # withdrawn
             elif self._elapsed_ns() > job.expires_ns and model_file_name(counter) not in self.files.in_flight:
-                self._end(
-                    job,
-                    "failed",
-                    "no answer in time"
-                    if not job.reports
-                    else f"still {job.stage} when its time was up; give more by --timeout",
-                )
+                still = f"still {job.stage} when its time was up; give more by --timeout"
+                self._end(job, "failed", still if job.reports else "no answer in time")
 
     def _read(self, counter: int) -> Job:
         tree = parse_line(_content(self._folder / f"{counter:020d}.json", MAX_JOB_BYTES))

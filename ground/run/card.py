@@ -22,9 +22,14 @@ USES = {
 }
 
 
+def one_frame(imported: bool) -> str:
+    """Return what one of a session's frames is called: imported pictures are nobody's frames."""
+    return "picture" if imported else "frame"
+
+
 def frames(imported: bool) -> str:
-    """Return what a session's frames are called: imported pictures are nobody's frames."""
-    return "pictures" if imported else "frames"
+    """Return what a session's frames are called."""
+    return f"{one_frame(imported)}s"
 
 
 def readings(imported: bool) -> str:
@@ -81,7 +86,7 @@ def chi2_explained(chi2: float) -> str:
 
 def model_card(session_created_utc: str, metrics: dict) -> str:
     """Return the card as Markdown; figures that were not measured are left out."""
-    trained_on = counted(metrics["frames_trained"], frames(is_imported(metrics))[:-1])
+    trained_on = counted(metrics["frames_trained"], one_frame(is_imported(metrics)))
     lines = [
         "# Model card",
         "",

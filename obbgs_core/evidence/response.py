@@ -4,9 +4,8 @@ The model is one for all exposure times. If the readings of long exposures are t
 ones too dark, by a ratio that is a power of the exposure time, then readings are that power of light. Compared are
 neighbours in a bracket, or, where every view has one exposure, frames of neighbouring settings that see the target from
 nearly the same direction: from another, glare differs by more than what is looked for. Of what they say the median
-counts. An exposure time that an automatic camera chose by what it saw
-says what it saw, and tells nothing. Readings count in the radiance that both can read, so that a model which is too
-dark where it is bright is no evidence either.
+counts. An exposure time that an automatic camera chose by what it saw says what it saw, and tells nothing. Readings
+count in the radiance that both can read, so that a model which is too dark where it is bright is no evidence either.
 
 Ratios that follow no power are those of exposure times which are not as stated, each by a factor; the median is taken
 as stated, since what all share is the unit of light. A ratio that grows along the pass, alike in the frames of every
@@ -227,9 +226,14 @@ class _Pair(NamedTuple):
     other: int
 
 
+def _directions(frames: list[TrainingFrame]) -> np.ndarray:
+    """Return the directions [N, 3], unit, from which frames see the target."""
+    return torch.nn.functional.normalize(cameras_of(frames).centres.double(), dim=1).numpy()
+
+
 def _explained(frames: list[TrainingFrame]) -> float:
     """Return the adjusted R² of frames' places in the pass by the directions from which they see the target."""
-    directions = torch.nn.functional.normalize(cameras_of(frames).centres.double(), dim=1).numpy()
+    directions = _directions(frames)
     design, along = np.column_stack([directions, np.ones(len(frames))]), np.arange(len(frames))
     fitted = design @ np.linalg.lstsq(design, along)[0]
     unexplained = np.sum((along - fitted) ** 2) / np.sum((along - along.mean()) ** 2)
@@ -256,8 +260,8 @@ def _in_turns(frames: list[TrainingFrame]) -> list[_Pair]:
     exposures_s = np.array([frame.exposure_time_s for frame in frames])
     times_s, counts = np.unique(exposures_s, return_counts=True)
     settings = times_s[(2 * counts > counts.max()) & (counts >= LEFT_OUT)]
-    along = torch.nn.functional.normalize(cameras_of(frames).centres.double(), dim=1).numpy()
-    cosines = along @ along.T
+    directions = _directions(frames)
+    cosines = directions @ directions.T
     middles = [0]  # of parts: each is as far from those before it as any frame
     while len(middles) < LEFT_OUT:
         middles.append(int(cosines[:, middles].max(axis=1).argmin()))

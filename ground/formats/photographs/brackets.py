@@ -9,6 +9,7 @@ import imagecodecs
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ground.formats.axes import rigid_inverse
 from ground.formats.pictures.view import View, colours_of, grey_light, has_display_values, read_image
 from ground.formats.pictures.views import EQUAL_EXPOSURES
 from obbgs_base.files import write_whole
@@ -68,7 +69,7 @@ def in_brackets_of_places(views: Sequence[View]) -> list[View]:
     if any(view.bracket is not None or view.split is not None for view in views):
         return list(views)
     brackets = brackets_of(views)
-    centres = np.stack([np.linalg.inv(view.world_to_camera)[:3, 3] for view in views])
+    centres = np.stack([rigid_inverse(view.world_to_camera)[:3, 3] for view in views])
     nearest = SAME_PLACE * float(np.ptp(centres, axis=0).max())
     if all(_of_one_place(bracket, nearest) for bracket in brackets):
         return [view for bracket in brackets for view in bracket]
@@ -77,14 +78,12 @@ def in_brackets_of_places(views: Sequence[View]) -> list[View]:
 
 def _of_one_place(bracket: Sequence[View], nearest: float) -> bool:
     """Return whether the cameras of a bracket lie as near to its first and are turned as little as SAME_PLACE asks."""
-    first = bracket[0].world_to_camera
-    for view in bracket[1:]:
-        turn = first[:3, :3] @ view.world_to_camera[:3, :3].T
-        angle = np.linalg.norm(Rotation.from_matrix(turn).as_rotvec())
-        away = np.linalg.norm(np.linalg.inv(view.world_to_camera)[:3, 3] - np.linalg.inv(first)[:3, 3])
-        if angle > SAME_PLACE or away > nearest:
-            return False
-    return True
+    first, *others = (rigid_inverse(view.world_to_camera) for view in bracket)
+    return all(
+        Rotation.from_matrix(first[:3, :3].T @ other[:3, :3]).magnitude() <= SAME_PLACE
+        and np.linalg.norm(other[:3, 3] - first[:3, 3]) <= nearest
+        for other in others
+    )
 
 
 def write_for_features(folder: Path, brackets: Sequence[Sequence[View]]) -> None:

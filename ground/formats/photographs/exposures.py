@@ -93,7 +93,7 @@ def with_exposures(views: Sequence[View], table: dict[str, Light] | None = None)
     headers = {view.image: read_header(view.image) for view in views}
     if turned := sum(header.orientation != 1 for header in headers.values()):
         log.warning(
-            "%s, by the file, to be shown turned; cameras are taken to be of the pixels as stored",
+            "files say of %s to show them turned; cameras are taken to be of the pixels as stored",
             counted(turned, "picture"),
         )
     if table is not None:
@@ -245,7 +245,7 @@ def estimated(
     connected = {number for first, second, *_ in shared for number in (first, second)}
     if alone := [view.image.name for number, view in enumerate(views) if number not in connected]:
         log.warning(
-            "the mean of all exposures is taken for %s with too little in common with others to estimate: %s",
+            "of %s too little is seen in others to estimate exposures, and the mean of all is taken: %s",
             *(counted(len(alone), "picture"), ", ".join(alone[:5])),
         )
     seconds = (gains / gains.max()).tolist()

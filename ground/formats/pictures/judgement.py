@@ -122,7 +122,7 @@ def _full_scale(name: str, seen: _Seen) -> tuple[float, int]:
     """
     if name == "float32":
         log.warning(
-            "%s with floats: full scale is their largest value, %.6g",
+            "floats in %s: full scale is their largest value, %.6g",
             counted(seen.pictures, "picture"),
             seen.top,
         )

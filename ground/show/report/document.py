@@ -12,6 +12,7 @@ from ground.run.card import (
     frames_captured,
     frames_received,
     is_imported,
+    one_frame,
     readings,
     scored_frames,
 )
@@ -50,7 +51,7 @@ def write_report(session_dir: Path, name: str, out: Path | None = None) -> Path:
     """
     run = open_run(session_dir, name, out)
     truth = Truth(run.session) if Truth.exists(run.session) else None
-    count, called = run.metrics["frames_received"], frames(is_imported(run.metrics))[:-1]
+    count, called = run.metrics["frames_received"], one_frame(is_imported(run.metrics))
     content = page(
         f"Reconstruction of {pass_name(run.session.path)}, run {name}",
         f"Method {run.metrics['method']}, {counted(count, called)}, session of "
@@ -201,8 +202,8 @@ def _exposure_ms(key: str) -> str:
 def _model(run: Run) -> str:
     m, called = run.metrics, frames(is_imported(run.metrics))
     note = (
-        f"The target in 3D, made from {counted(m['frames_trained'], called[:-1])} and drawn as the camera would see it "
-        f"at the chosen {'brightness' if run.session.nominal_exposures else 'exposure'}. Drag to turn, wheel or "
+        f"The target in 3D, made from {counted(m['frames_trained'], one_frame(is_imported(m)))} and drawn as the camera "
+        f"would see it at the chosen {'brightness' if run.session.nominal_exposures else 'exposure'}. Drag to turn, wheel or "
         "pinch to zoom, shift and drag to move."
     )
     if m["scored_frames"] == "held_out":

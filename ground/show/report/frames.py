@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
-from ground.run.card import frames, is_imported
+from ground.run.card import frames, is_imported, one_frame
 from ground.run.estimated_poses import as_estimated, read_estimate, scored_records
 from ground.run.evaluate import clean_image, model_image, noisy_image
 from ground.run.runs import Run
@@ -33,7 +33,7 @@ NOISE_DEVIATIONS = 5.0  # no pixel of a frame rises by so many for noise alone
 def frames_section(run: Run) -> str:
     posed = as_estimated(run.session, read_estimate(run.folder)).frames
     by_place = {(r.bracket, r.bracket_index): r for r in posed}
-    bracketed, frame = run.session.is_bracketed, frames(is_imported(run.metrics))[:-1]
+    bracketed, frame = run.session.is_bracketed, one_frame(is_imported(run.metrics))
     picked = evenly_spread(sorted({r.bracket for r in run.session.frames}), COLUMNS)
     cells = []
     for place in sorted({r.bracket_index for r in run.session.frames}):
@@ -77,7 +77,7 @@ def scored_section(run: Run, truth: Truth | None) -> str:
         body.append(f"<h3>{named}</h3>")
         body.append(_compared(run, truth, of_view))
     training, imported = run.metrics["scored_frames"] == "training", is_imported(run.metrics)
-    frame = frames(imported)[:-1]
+    frame = one_frame(imported)
     group = "bracket" if bracketed else "picture"
     few = f"trained on: the session has too few {group}s to hold one out"
     seen = few if training else "never trained on"
@@ -107,13 +107,13 @@ def _range(run: Run, record: FrameRecord) -> str:
 def _mean(run: Run, truth: Truth | None) -> str:
     """Return in words the mean PSNR of all scored frames; nothing for a run that was not scored."""
     mean_db = run.metrics.get("psnr_clean_db" if truth else "psnr_noisy_db")
-    what = counted(len(run.scored), frames(is_imported(run.metrics))[:-1])
+    what = counted(len(run.scored), one_frame(is_imported(run.metrics)))
     return "" if mean_db is None else f"; its mean over all {what} is {mean_db:.2f} dB"
 
 
 def _compared(run: Run, truth: Truth | None, of_view: list[FrameRecord]) -> str:
     """Return the frames of a bracket, shortest exposure first, beside the renders of each model and their errors."""
-    frame = frames(is_imported(run.metrics))[:-1]
+    frame = one_frame(is_imported(run.metrics))
     reference = "truth" if truth else frame
     names = [reference, "render", "error"] + (["blind render", "blind error"] if run.blind else [])
     expected = [clean_image(run, truth, r) if truth else noisy_image(run, r) for r in of_view]

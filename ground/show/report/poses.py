@@ -9,8 +9,7 @@ import plotly.graph_objects as go
 import torch
 from plotly.subplots import make_subplots
 
-from ground.run.card import frames as frames_called
-from ground.run.card import is_imported
+from ground.run.card import is_imported, one_frame
 from ground.run.estimated_poses import doubts_left, read_estimate
 from ground.run.runs import Run
 from ground.session.spread import evenly_spread
@@ -102,7 +101,7 @@ def pose_history(run: Run, estimate: PoseEstimate) -> PoseHistory:
         (times_ns - times_ns[0]) / 60e9 if timed else np.array(ids),
         "minutes" if timed else "picture",
         "m" if states_scale(run.session) else "units",
-        frames_called(is_imported(run.metrics))[:-1],
+        one_frame(is_imported(run.metrics)),
         motion_vectors(estimated @ torch.linalg.inv(tagged)).numpy(),
         PoseCorrections(frames).covariances.numpy(),
         doubts_left(run.session, [records[number] for number in ids], estimate),
