@@ -201,10 +201,11 @@ def _exposure_ms(key: str) -> str:
 
 def _model(run: Run) -> str:
     m, called = run.metrics, frames(is_imported(run.metrics))
+    made_from = counted(m["frames_trained"], one_frame(is_imported(m)))
     note = (
-        f"The target in 3D, made from {counted(m['frames_trained'], one_frame(is_imported(m)))} and drawn as the camera "
-        f"would see it at the chosen {'brightness' if run.session.nominal_exposures else 'exposure'}. Drag to turn, wheel or "
-        "pinch to zoom, shift and drag to move."
+        f"The target in 3D, made from {made_from} and drawn as the camera would see it at the chosen "
+        f"{'brightness' if run.session.nominal_exposures else 'exposure'}. Drag to turn, wheel or pinch to zoom, shift "
+        "and drag to move."
     )
     if m["scored_frames"] == "held_out":
         note += f" The next section says how well it matches {called} that it was not made from."
